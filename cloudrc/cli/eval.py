@@ -62,6 +62,10 @@ def arguments(parser: Parser) -> None:
     add("--deadline", "S", about, read=number(1e-6, 3600, "seconds"))
     about = "size of an observation on the wire (default: that of its arrays)"
     add("--observation-bytes", "N", about, read=whole_number(0, 10**9))
+    about = "what of a message arrives (default: stream for a server, else datagrams)"
+    add("--delivery", None, about, choices=("datagrams", "stream"))
+    about = "most bytes of a packet; what is larger is several packets (default: 1200)"
+    add("--packet-bytes", "N", about, 1200, whole_number(1, 10**9))
     about = "parallel processes for a policy in a file (default: one per core)"
     add("--jobs", "N", about, COUNT_MAX, read_count)
     add("--out", "DIR", "folder (default: a new one in runs/); if it has rows, play the others")
@@ -92,8 +96,8 @@ def execute(options: Options) -> int:
             results.check_folder(folder, setup)
     with Progress(f"makes the environment {setup.env}"):
         setup = check_environment(setup, episodes)
-    if not setup.follows_seed:
-        tell(f"warning: --env {setup.env}: {results.SEEDLESS}")
+    for text in _warnings(setup, episodes):
+        tell(f"warning: {text}")
     episodes = [*(Episode(None, BASELINE, n + 1) for n in range(options.seeds)), *episodes]
     known = results.read_before(folder, setup) if goes_on else results.Before()
     known, before = _versus(options, known, setup, episodes)
@@ -101,7 +105,7 @@ def execute(options: Options) -> int:
         folder = new_folder(folder, f"eval-{Path(setup.env).name}", "latest-eval")
     with lock_folder(folder):
         with Progress("plays episodes", len(episodes)) as view:
-            view.say(f"{setup.env}: {len(episodes)} episodes, step {setup.step}")
+            view.say(f"{setup.env}: {len(episodes)} episodes, {setup.facts}")
             try:
                 rows, stopped = results.play_missing(
                     folder, setup, episodes, options.jobs, known, view.count
@@ -125,6 +129,15 @@ def execute(options: Options) -> int:
     text = f"{results.as_text(document)}\n{escape(str(page))}"
     print_result(options.output, document, text, **tables)
     return 0
+
+
+def _warnings(setup: EvalSetup, episodes: list[Episode]) -> list[str]:
+    """Say what makes episodes pointless, before they are played."""
+    from cloudrc.eval.episode import describe_doubts
+    from cloudrc.eval.results import SEEDLESS
+
+    seedless = [] if setup.follows_seed else [f"--env {setup.env}: {SEEDLESS}"]
+    return [*seedless, *describe_doubts(setup, episodes)]
 
 
 def _versus(
@@ -164,6 +177,8 @@ def _report(
     from cloudrc.eval.provenance import provenance
 
     found = judge(rows, before, *known) | known._asdict()
+    for outcome in found["outcomes"][1:]:
+        outcome |= setup.sent
     found["success"] = results.describe_success(setup, found["outcomes"])
     found |= provenance(setup, shlex.join(["cloudrc", *options.given]))
     document = results.write(folder, setup, found)
@@ -189,6 +204,8 @@ def _read(options: Options) -> tuple[EvalSetup, list[Episode]]:
         options.observation_bytes,
         options.answer_within,
         deadline=options.deadline,
+        delivery=options.delivery or ("stream" if "://" in options.policy else "datagrams"),
+        packet_bytes=options.packet_bytes,
     )
     values.check_policy(setup.policy)
     values.check_rows(options.rows)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import cache
@@ -23,6 +24,8 @@ from cloudrc.errors import CloudrcError
 from cloudrc.eval.environment import environment_code, find_module
 from cloudrc.eval.setup import BARE, SEED, Episode, EvalSetup, link_at
 from cloudrc.gym import Networked
+from cloudrc.gym.doubts import LinkWarning, doubts
+from cloudrc.gym.options import asks_always, find_executor
 from cloudrc.gym.step import find_step
 from cloudrc.gym.values import leaves, size_of
 from cloudrc.outside.code import calling
@@ -118,6 +121,7 @@ def _numbers_of(loop: Mapping[str, Any]) -> dict[str, float]:
     for way in ("uplink", "downlink"):
         found |= {f"{name}_{way}": loop[way][name] for name in ("delay_asked", "delay_measured")}
         found[f"loss_{way}"] = loop[way]["loss_measured"]
+        found |= {f"{name}_{way}": loop[way][name] for name in ("packets_sent", "packets_lost")}
     return found
 
 
@@ -279,18 +283,22 @@ def _connect(
 ) -> Networked:
     """Put the link between environment and policy, which has answered with `count` actions."""
     sent = setup.observation_bytes
-    return Networked(
-        env,
-        link_at(setup.link, episode.rtt_ms),
-        episode.seed,
-        dt=setup.dt,
-        compute=policy.duration if setup.is_measured else setup.compute_times,
-        answer_within=setup.answer_within,
-        chunk=count,
-        executor=episode.chosen,
-        observation_bytes=policy.size if sent is None else sent,
-        start="answer",  # a robot does nothing before its policy has answered
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LinkWarning)  # `describe_doubts` tells it once
+        return Networked(
+            env,
+            link_at(setup.link, episode.rtt_ms),
+            episode.seed,
+            dt=setup.dt,
+            compute=policy.duration if setup.is_measured else setup.compute_times,
+            answer_within=setup.answer_within,
+            chunk=count,
+            executor=episode.chosen,
+            observation_bytes=policy.size if sent is None else sent,
+            delivery=setup.delivery,
+            packet_bytes=setup.packet_bytes,
+            start="answer",  # a robot does nothing before its policy has answered
+        )
 
 
 def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
@@ -317,13 +325,25 @@ def check_environment(setup: EvalSetup, episodes: list[Episode]) -> EvalSetup:
             Networked(env, dt=setup.dt, chunk=1, executor=episode.chosen, answer_within=wait)
     if not setup.is_remote:
         _load(setup.policy)
-    digests = {_first_observation(setup) for _ in range(2)}
-    return replace(setup, follows_seed=len(digests) == 1, env_code=code, step=step)
+    digests, sizes = zip(*(_first_observation(setup) for _ in range(2)), strict=True)
+    size = sizes[0] if setup.observation_bytes is None else setup.observation_bytes
+    same = digests[0] == digests[1]
+    return replace(setup, follows_seed=same, env_code=code, step=step, sent_bytes=size)
 
 
-def _first_observation(setup: EvalSetup) -> str:
-    """Return the hash of the observation with which an environment begins the seed 1."""
+def _first_observation(setup: EvalSetup) -> tuple[str, int]:
+    """Return hash and size [bytes] of the observation with which the seed 1 begins."""
     with make_env(setup, 1) as env:
         witness = _Witness(env)
-        witness.reset(seed=1)
-        return witness.digest.hexdigest()
+        observation, _ = witness.reset(seed=1)
+        return witness.digest.hexdigest(), size_of(observe(observation, setup.mapped))
+
+
+def describe_doubts(setup: EvalSetup, episodes: Iterable[Episode]) -> list[str]:
+    """Say what makes observations over the link useless: few arrive, or their rate is too high."""
+    assert setup.sent_bytes is not None
+    assert setup.step is not None
+    chosen = {each.point["executor"]: each.chosen for each in episodes}.values()
+    always = any(asks_always(find_executor(each, chunked=True)[0]) for each in chosen)
+    wires = [setup.wire(setup.sent_bytes, uplink=True)]
+    return list(doubts(wires, setup.step.seconds, asks_always=always))

@@ -100,7 +100,7 @@ def write_page(folder: Path, setup: EvalSetup, document: Mapping[str, Any]) -> P
     page = TEMPLATE.substitute(
         title=escape(f"{setup.env}: {Path(setup.policy).name} over {setup.link}"),
         facts=escape(
-            f"{count} episodes per condition; step {setup.step}; success: {document['success']}."
+            f"{count} episodes per condition; {setup.facts}; success: {document['success']}."
         ),
         warning=_paragraphs(warnings, ' class="warning"'),
         figure=_inline(figure),

@@ -39,8 +39,12 @@ PAIRED = (
     "code",
     "answer_within",
     "observation_bytes",
+    "delivery",
+    "packet_bytes",
 )
 """What two evaluations must share for a comparison of their policies."""
+FLAGS = {"delivery": "--delivery", "packet_bytes": "--packet-bytes"}
+"""Of these, how the flags are called that people have to give."""
 LEGEND = (
     "loop: time from an observation to its action; ended: terminated/truncated/by --max-steps; "
     "held: steps without a\nnew action; age: of the observation behind an action, in so many "
@@ -50,6 +54,7 @@ COLUMNS = {
     "round trip": "{rtt_ms:g} ms",
     "loop": "{loop_age_ms:.0f} ms",
     "executor": "{executor}",
+    "on link": "{observation_bytes:,} B, {on_link_ms:.2g} ms",
     "return": "{return:.5g}",
     "95 %": "{return_low:.5g} .. {return_high:.5g}",
     "success": "{successes}/{episodes}",
@@ -177,6 +182,9 @@ def write(folder: Path, setup: EvalSetup, found: Mapping[str, Any]) -> dict[str,
         "link": setup.link,
         "compute": setup.compute,
         "step": setup.step and setup.step._asdict(),
+        "delivery": setup.delivery,
+        "packet_bytes": setup.packet_bytes,
+        **setup.sent,
         "repeatable": setup.is_repeatable,
         "code": source.code_hash(),
         "identity": setup.identity(),
@@ -203,7 +211,9 @@ def read_versus(folder: Path, setup: EvalSetup, episodes: Sequence[Episode]) -> 
     before = {**had["identity"], "code": had["code"]}
     now = {**setup.identity(), "code": source.code_hash()}
     if other := [name for name in PAIRED if before.get(name) != now[name]]:
-        raise InvalidValueError(f"differs in {', '.join(other)}; evaluate it again")
+        told = ", ".join(FLAGS.get(name, name) for name in other)
+        hint = f" (it has --delivery {before.get('delivery')})" * ("delivery" in other)
+        raise InvalidValueError(f"differs in {told}{hint}; evaluate it again")
     rows = read_rows(folder)
     return [rows[key] for each in episodes if (key := each.key(had["identity"])) in rows]
 

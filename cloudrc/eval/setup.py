@@ -6,12 +6,14 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
+from math import isnan
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from cloudrc.gym.loop import DATAGRAMS, Wire
 from cloudrc.gym.step import StepTime
-from cloudrc.link.library import LinkProfile, read_profile
+from cloudrc.link.library import PACKET_BYTES, LinkProfile, read_profile
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.outside.code import sources
 from cloudrc.outside.reuse import reuse
@@ -27,7 +29,14 @@ SEED = "{seed}"
 """Value of an environment's argument that stands for the seed of the episode."""
 BASELINE = "no network"
 """Executor of the episodes without a network: the policy answers each observation in its step."""
-BARE: dict[str, Any] = {"link": "ideal", "compute": 0.0, "observation_bytes": None}
+BARE: dict[str, Any] = {
+    "link": "ideal",
+    "compute": 0.0,
+    "observation_bytes": None,
+    "delivery": DATAGRAMS,
+    "packet_bytes": PACKET_BYTES,
+    "sent_bytes": None,
+}
 """What these episodes have in place of the values of the setup."""
 
 
@@ -51,6 +60,9 @@ class EvalSetup:
     env_code: str = ""  # hash of the environment's code and files
     deadline: float | None = None  # an action of an older observation is late [s]
     step: StepTime | None = None  # of the environment, and who tells its time
+    delivery: str = DATAGRAMS  # of messages, as `Networked` takes it
+    packet_bytes: int = PACKET_BYTES  # most bytes of a packet
+    sent_bytes: int | None = None  # of the first observation on the wire; None: not known yet
 
     @property
     def is_remote(self) -> bool:
@@ -71,6 +83,30 @@ class EvalSetup:
     def compute_times(self) -> Any:
         """Time for an answer, or its mean and its deviation [s], unless it is measured."""
         return fmean(self.times) if self.times else self.compute
+
+    def wire(self, size: int, *, uplink: bool) -> Wire:
+        """Return how messages of `size` bytes cross the link: observations, or answers."""
+        return Wire(read_profile(self.link), uplink, size, self.delivery, self.packet_bytes)
+
+    @property
+    def sent(self) -> dict[str, Any]:
+        """An observation on the wire: bytes, packets, and its time at the bottleneck if any."""
+        if self.sent_bytes is None:
+            return {}
+        wire = self.wire(self.sent_bytes, uplink=True)
+        found = {"observation_bytes": wire.size, "observation_packets": wire.cut.usual}
+        return found if isnan(wire.occupies) else {**found, "on_link_ms": 1e3 * wire.occupies}
+
+    @property
+    def facts(self) -> str:
+        """The step and, in words, how large an observation is on the wire, and its time there."""
+        if not self.sent:
+            return f"step {self.step}"
+        text = f"step {self.step}, observations of {self.sent_bytes:,} bytes"
+        if (count := self.sent["observation_packets"]) > 1:
+            text += f" in {count:,} packets ({self.delivery})"
+        on_link = self.sent.get("on_link_ms")
+        return text if on_link is None else f"{text}, {on_link:.2g} ms on the link"
 
     def identity(self) -> dict[str, Any]:
         """Return all that the result of an episode depends on, but its condition and seed: JSON."""

@@ -12,7 +12,9 @@ from cloudrc.errors import InterruptedRunError
 from cloudrc.eval.episode import play
 from cloudrc.eval.page import PANELS, panel_of
 from cloudrc.eval.setup import BASELINE, Episode, EvalSetup
+from cloudrc.trials.rows import read_rows
 from tests.eval.test_eval import bare, stand
+from tests.policy.conftest import serving
 
 
 def test_the_episodes_without_a_network_are_the_policys_own_whatever_link_and_time(law):
@@ -48,6 +50,8 @@ def test_two_policies_are_compared_in_pairs_and_other_conditions_are_refused(
     for name, value in (("link", "lte"), ("answer-within", 0.02)):
         refused = evaluate(*versus, tmp_path / "c", f"--{name}", value, code=2).err
         assert f"a: differs in {name.replace('-', '_')}; " in refused
+    refused = evaluate(*versus, tmp_path / "c", "--delivery", "stream", code=2).err
+    assert "--delivery datagrams" in refused
     assert not (tmp_path / "c").exists()
 
 
@@ -139,6 +143,30 @@ def test_a_condition_without_any_answer_stands_at_the_asked_time():
     unknown = {"executor": "broker", "success": 0.0, **asked}
     points = panel_of([bare, {**known, **asked}, unknown], 0.05, *PANELS[0]).lines["broker"]
     assert [(each.x, each.failed) for each in points] == [(65, False), (350, True)]
+
+
+def test_the_bytes_of_an_observation_and_their_time_on_the_link_are_told(law, tmp_path, evaluate):
+    words = "--link lte --rtt 0 --seeds 1 --observation-bytes 27600 --policy".split()
+    run = evaluate(*words, law(), "--out", tmp_path / "a")
+    assert "27,600 bytes in 23 packets (datagrams), 23 ms" in run.err  # at 10 Mbit/s, with headers
+    assert "27,600 B, 23 ms" in run.out
+    document = json.loads((tmp_path / "a" / "eval.json").read_text())
+    found = document["outcomes"][1], document
+    for each in found:
+        assert (each["observation_bytes"], each["observation_packets"]) == (27_600, 23)
+        assert each["on_link_ms"] == pytest.approx((27_600 + 23 * 28) * 8 / 10_000)
+    (row,) = (each for each in read_rows(tmp_path / "a").values() if each["point"]["rtt_ms"] == 0)
+    assert row["numbers"]["packets_sent_uplink"] % 23 == 0
+
+
+def test_a_server_is_asked_over_a_stream_unless_another_delivery_is_given(law, tmp_path, evaluate):
+    words = "--link lossy --rtt 0 --seeds 1 --observation-bytes 27600 --out".split()
+    with serving(law()) as url:
+        evaluate(*words, tmp_path / "a", "--policy", url)
+        evaluate(*words, tmp_path / "b", "--policy", url, "--delivery", "datagrams")
+    read = [json.loads((tmp_path / name / "eval.json").read_text()) for name in "ab"]
+    assert [each["delivery"] for each in read] == ["stream", "datagrams"]
+    assert [each["outcomes"][1]["loss_uplink"] > 0 for each in read] == [False, True]
 
 
 def test_the_page_has_figure_tests_notes_and_how_it_was_made(law, tmp_path, monkeypatch, evaluate):
