@@ -37,12 +37,13 @@ examples:
   cloudrc relay ros --from /remote/cmd_vel --to /cmd_vel --link lte --direction downlink
   cloudrc link set uplink.delay_ms=120      (meanwhile, in another terminal)
 
-Each message is a packet of the link, whatever its type and size. The relay
-waits for a node that publishes --from, and takes its type. Ctrl-C ends the
+Each message is a packet of the link. A message above 1200 bytes is several: of a
+BEST_EFFORT topic it is lost with any of them, of a RELIABLE one it is repaired,
+and late. The relay waits for a node that publishes --from, and takes its type. Ctrl-C ends the
 relay, and prints what the profile asks for and what was measured.
 
 A subscription that wants RELIABLE hears the relay only with --reliable: then
-ROS repeats what it loses itself, but not what the link loses.
+ROS repeats what it loses itself, but not the small messages that the link loses.
 
 Needs a sourced ROS 2, exit code 3 without it."""
 

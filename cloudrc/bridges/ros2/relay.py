@@ -1,6 +1,8 @@
 """Hand the messages of a topic on to another topic, each one late, lost or doubled as a link does.
 
-Messages cross as raw bytes, so they may have any type. Each one is a packet of the link.
+Messages cross as raw bytes, so they may have any type. Each one is a packet of the link, or several
+packets. Of several, the losses of a RELIABLE topic are repaired; a message of a BEST_EFFORT one is
+lost with any of them.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from cloudrc.bridges.ros2 import saying
 from cloudrc.bridges.ros2.own_node import LINGERS, OwnNode, clash, in_words, known, name_of
 from cloudrc.errors import BadInputError
 from cloudrc.link.carry.engine import BATCH, Engine, LinkWay, Packet
-from cloudrc.link.library import KIND
+from cloudrc.link.carry.messages import MessageWay
+from cloudrc.link.carry.tcp.medium import Medium
 
 DEPTH = 100
 """Number of messages that ROS keeps until they are read: a burst is no loss of the link."""
@@ -78,10 +81,13 @@ class TopicRelay(OwnNode):
             first = f"node {name_of(infos[0])} publishes {self.source} as {self.kind}"
             raise BadInputError(f"{first}, but {texts[0]}; {LINGERS}")
 
-    def open(self, way: LinkWay, *, reliable: bool) -> tuple[Engine, str]:
+    def open(
+        self, way: LinkWay, media: tuple[Medium, Medium], *, reliable: bool
+    ) -> tuple[Engine, MessageWay, str]:
         """Begin to hear, with the QoS of the publishers; the output is RELIABLE if `reliable`.
 
-        Return the engine that carries the messages, and the QoS of both topics in words.
+        `media` repair the losses of large messages of a RELIABLE source. Return the engine that
+        carries the messages, their way, and the QoS of both topics in words.
 
         Raises:
             MissingPrerequisiteError: If this ROS does not have the type.
@@ -96,7 +102,10 @@ class TopicRelay(OwnNode):
             kind, self.source, lambda data: None, heard, raw=True
         )
         self._publisher = self.node.create_publisher(kind, self.target, sent)
-        return Engine(self, (way,), CAPACITY), f"{in_words(heard)} in, {in_words(sent)} out"
+        # The calls of repairs wait in the engine's queue, too: none of them may be dropped.
+        engine = Engine(self, (way,), None if is_reliable else CAPACITY)
+        self._carried = MessageWay(engine, way, media if is_reliable else None)
+        return engine, self._carried, f"{in_words(heard)} in, {in_words(sent)} out"
 
     def _load(self) -> Any:
         package, _, name = self.kind.partition("/msg/")
@@ -156,9 +165,8 @@ class TopicRelay(OwnNode):
                 taken = handle.take_message(self._type, True)
             if taken is None:
                 return
-            data = taken[0]
-            header = (KIND, 1, way.received)
-            yield Packet(way, header, len(data), data, time.monotonic_ns())
+            if packet := self._carried.take(taken[0], time.monotonic_ns()):
+                yield packet
         way.waited += BATCH
 
     def publish(self, data: bytes) -> bool:

@@ -63,7 +63,7 @@ class CellEngine(Engine):
         links = [way.link for way in ways]
 
         def onward(link: LinkDirection, arrivals: Sequence[int], data: Any) -> None:
-            self.queue.put(self._leave, arrivals, (ways[links.index(link)], 0, data))
+            self.queue.put(self.leave, arrivals, (ways[links.index(link)], 0, data))
 
         self._ways = (*self._ways, *ways)
         queue = CellQueue(robot, self._cells, orders, links, onward)

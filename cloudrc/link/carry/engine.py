@@ -95,7 +95,7 @@ class Engine:
 
     def take_in(self) -> None:
         """Take packets from the port, and compute when each is due."""
-        put, leave = self.queue.put, self._leave
+        put, leave = self.queue.put, self.leave
         for way, (kind, epoch, counter), size, data, now_ns in self._port.take():
             link, number = way.link, way.received
             way.received += 1
@@ -117,7 +117,8 @@ class Engine:
             due_ns, call, arguments = queue.pop()
             call(*arguments, due_ns)
 
-    def _leave(self, way: LinkWay, number: int, data: Any, due_ns: int) -> None:
+    def leave(self, way: LinkWay, number: int, data: Any, due_ns: int) -> None:
+        """Hand on the packet with this number of its direction, which is due."""
         now_ns = time.monotonic_ns()
         if not way.give(data):
             self.unsent += 1

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}  # name -> quantile of the lateness, in [0, 1]
 LOGGED_MAX = 1_000_000  # packets of a direction that are recorded
 LOST = -1  # time of a packet that does not arrive
+PENDING = -2  # time of a packet of which it is not known yet
 _BITS = 7  # number of significant bits of a lateness that select its bucket: buckets are 1.6 % wide
 _EARLY = -1  # bucket of the packets that left before they were due
 
@@ -50,7 +51,7 @@ class PacketLog:
     """What happened to the packets of one direction: an entry per packet in each array.
 
     Times are on the monotonic clock [ns]. `due` and `left` are LOST for a packet that did not
-    arrive. `left` is that of the copy that left first.
+    arrive; `due` is PENDING while a loss is repaired. `left` is that of the copy that left first.
     """
 
     def __init__(self, limit: int = LOGGED_MAX) -> None:
@@ -70,6 +71,11 @@ class PacketLog:
             self.due.append(min(arrivals) if arrivals else LOST)
             self.left.append(LOST)
             self.copies.append(0)
+
+    def arrive(self, number: int, due_ns: int) -> None:
+        """Note when the packet `number`, which was PENDING, is due."""
+        if number < len(self.due):
+            self.due[number] = due_ns
 
     def leave(self, number: int, now_ns: int) -> None:
         """Note that a copy of the packet `number` has left."""

@@ -9,7 +9,7 @@ from math import nan
 import numpy as np
 
 from cloudrc.link.carry.log import LOST, PacketLog
-from cloudrc.link.library import KIND
+from cloudrc.link.library import KIND, PACKET_BYTES
 from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.profile import DirectionProfile, Timeline
 from cloudrc.link.streams import Stream
@@ -56,6 +56,8 @@ def judge_packets(log: PacketLog, period: Period) -> list[tuple[float, Judgement
     if limited:  # a packet waits for those before it
         few = slice(QUEUED_PACKETS)
     asked = replace(plan, sent=applied.sent[few]).asked()
+    if size > PACKET_BYTES:  # of a message in several packets, only the applied values are known
+        asked = dict.fromkeys(asked, nan)
     if not limited:
         asked["reordered"] = nan  # depends on how close to each other packets are sent
     rows = plan.judge_applied(applied, measured)
@@ -85,5 +87,5 @@ def recording(log: PacketLog, origin_ns: int) -> Iterator[str]:
     rows = zip(log.sent, log.left, log.due, log.size, strict=False)
     for sent, left, due, size in rows:
         delay = "" if left == LOST else f"{(left - sent) * 1e-6:.4f}"
-        applied = "" if due == LOST else f"{(due - sent) * 1e-6:.4f}"
+        applied = "" if due < 0 else f"{(due - sent) * 1e-6:.4f}"
         yield f"{(sent - origin_ns) * 1e-9:.6f},{delay},{applied},{size}"

@@ -18,6 +18,7 @@ from cloudrc.config.profile import DIRECTIONS, load_profile
 from cloudrc.drivers.link_control import ControlServer
 from cloudrc.drivers.local import LINK, LINK_FOLDER, announced, link_socket, socket_folder
 from cloudrc.link.carry.engine import Engine, LinkWay
+from cloudrc.link.carry.messages import MessageWay
 from cloudrc.link.carry.tcp.medium import Medium
 from cloudrc.link.follow import Loaded, Profiles, make_folder, publish_state
 from cloudrc.link.model import LinkDirection
@@ -32,6 +33,8 @@ from cloudrc.runs.folder import new_folder
 STEP = 0.05  # longest time until the engine reacts to a change or a signal [s]
 Tell = Callable[[str], None]
 """Function that shows a line to the user."""
+Follower = LinkWay | Medium | MessageWay
+"""What follows the changes of a direction."""
 Check = Callable[[DirectionProfile, str], None]
 """Function that raises an error if a direction cannot have a profile."""
 
@@ -98,7 +101,7 @@ class LiveLink:
         self.origins_ns, self.unread = dict[str, int](), dict[str, int]()
         self.engine: Engine | None = None
         self.export: Callable[[LinkState], None] = lambda state: None
-        self._followers: Mapping[str, LinkWay | Medium] = {}
+        self._followers: Mapping[str, Follower] = {}
         self._stack = stack
         stack.callback(shutil.rmtree, self.folder, ignore_errors=True)
 
@@ -123,7 +126,7 @@ class LiveLink:
             link = LinkDirection(self.profile(way), self.seed, up, now_ns, stream=stream)
             self.ways[way] = LinkWay(link, give)
 
-    def serve(self, engine: Engine, media: Mapping[str, Medium] | None = None) -> None:
+    def serve(self, engine: Engine, media: Mapping[str, Follower] | None = None) -> None:
         """Take changes from now on, for `media`, else for `ways`; `engine` carries the packets."""
         self.engine, self._followers = engine, media or self.ways
         for way in DIRECTIONS:

@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.bridges.ros2 import require_ros
+from cloudrc.config.profile import DIRECTIONS
 from cloudrc.link.carry.engine import Engine
 from cloudrc.link.carry.punctual import ask_for_fifo, settle
+from cloudrc.link.carry.tcp.medium import Medium
+from cloudrc.link.model import HEADER_BYTES
 from cloudrc.runs.interrupts import until_interrupted
 from cloudrc.runs.links.carrier import STEP, CarrySettings, LiveLink
 from cloudrc.runs.links.programs_report import make_link_report, write_report
@@ -52,8 +55,22 @@ def relay_topic(settings: TopicSettings, tell: Callable[[str], None]) -> Report:
         link = LiveLink(settings, "relay ros", tell, stack, output=settings.out, flag="--out")
         relay.wait_for_publisher(tell)
         link.carry({way: relay.publish}, settings.stream)
-        engine, quality = relay.open(link.ways[way], reliable=settings.reliable)
-        link.serve(engine)
+        there, back = (
+            Medium(
+                link.profile(one),
+                settings.seed,
+                one == "uplink",
+                link.origins_ns[one],
+                stream=settings.stream,
+                headers=HEADER_BYTES,
+            )
+            for one in sorted(DIRECTIONS, key=lambda one: one != way)
+        )
+        engine, carried, quality = relay.open(
+            link.ways[way], (there, back), reliable=settings.reliable
+        )
+        other = "downlink" if way == "uplink" else "uplink"
+        link.serve(engine, {way: carried, other: back})
         settle()
         ask_for_fifo()
         tell(
