@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cloudrc.cluster.client import ClusterError, Release
+from cloudrc.cluster.client import ClusterError, NoAnswerError, Release
 from cloudrc.cluster.jobs import (
     JobReader,
     create_job,
@@ -31,10 +31,16 @@ FILE = "flights.json.gz"
 """Key in the ConfigMap under which the flights are stored."""
 VOLUME = "flights"
 """Volume of the pods with this ConfigMap."""
-REMEDY = (
-    "repeat the command, perhaps with --cpu 500m, --cpu-limit 1, --memory 512Mi or fewer --shards"
-)
-"""What a user can do if the cluster does not run the pods."""
+REMEDIES = {
+    **dict.fromkeys(
+        ("exceeded quota", "usage per", "Insufficient"),
+        "then repeat the command, with less: --cpu, --cpu-limit, --memory or fewer --shards",
+    ),
+    "persistentvolumeclaim": "make the claim, or repeat the command with another: --claim",
+    "PodSecurity": "then repeat the command, with the rights that it asks for: --set-job",
+    "was deleted": "repeat the command: it flies what is missing",
+}
+"""Words about a Job whose pods do not run -> what a user can do."""
 OUT_OF_MEMORY = (
     "it used more memory than the limit of its container (OOMKilled); "
     "raise it, such as --memory 1Gi, or fly shorter missions"
@@ -192,8 +198,11 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
 
     try:
         yield from JobReader(release, name, tell, describe_end).read()
+    except NoAnswerError as error:
+        raise NoAnswerError(f"{error}; Job '{name}' goes on without this command") from None
     except ClusterError as error:
-        raise ClusterError(f"{error}; {REMEDY}") from None
+        fixes = (fix for words, fix in REMEDIES.items() if words in str(error))
+        raise ClusterError("; ".join([str(error), *[*fixes][:1]])) from None
     if ending := failure_of(release.request("get", "jobs", name=name)):
         see = f"see: {release.kubectl} describe job {name}; then repeat the command"
         causes = [f"Job '{name}' failed: {ending}", *failures[-1:], see]

@@ -9,9 +9,10 @@ import json
 import logging
 import shutil
 import subprocess
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
@@ -33,6 +34,9 @@ a failed connection or a TLS error, and once if the server does not answer. A re
 object is repeated only after a failed connection or a TLS error."""
 BUSY = (429, 500, 502, 503, 504)
 """HTTP status codes after which the same request may succeed later."""
+PATIENCE, PAUSE = 60.0, 2.0
+"""Time for which a patient release sends a request again that gets no answer, and between two
+attempts [s]."""
 PROGRAM_LIMIT = 120.0
 """Time limit for one command of kubectl or helm [s], such as the copy of a recording."""
 STOP_LIMIT = 2.0
@@ -43,6 +47,9 @@ _KINDS = {
         name: ("CoreV1Api", name[:-1])
         for name in ("pods", "secrets", "events", "namespaces", "nodes")
     },
+    "persistentvolumeclaims": ("CoreV1Api", "persistent_volume_claim"),
+    "storageclasses": ("StorageV1Api", "storage_class"),
+    "networkpolicies": ("NetworkingV1Api", "network_policy"),
     "configmaps": ("CoreV1Api", "config_map"),
     "resourcequotas": ("CoreV1Api", "resource_quota"),
     "pods/log": ("CoreV1Api", "pod_log"),
@@ -52,6 +59,8 @@ _KINDS = {
     "statefulsets": ("AppsV1Api", "stateful_set"),
 }
 """Kind of objects -> class of the Kubernetes client, and the name of the kind in its methods."""
+OF_CLUSTER = ("namespaces", "nodes", "storageclasses", "selfsubjectaccessreviews")
+"""Kinds whose objects are in no namespace."""
 
 
 class ClusterError(CloudrcError):
@@ -64,12 +73,23 @@ class NotFoundError(ClusterError):
     """Report that the cluster does not have an object."""
 
 
+class ExistsError(ClusterError):
+    """Report that the cluster already has an object of this name."""
+
+
 class ExpiredError(ClusterError):
     """Report that the API server no longer has the changes since a version of an object."""
 
 
 class NoAnswerError(ClusterError):
     """Report that the API server does not answer; what runs in the cluster goes on."""
+
+
+ERRORS: dict[int, type[ClusterError]] = {
+    **{404: NotFoundError, 409: ExistsError, 410: ExpiredError},
+    **dict.fromkeys(BUSY, NoAnswerError),
+}
+"""HTTP status code -> error."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +100,8 @@ class Release:
     namespace: str | None  # None (with kubectl only): that of the context
     name: str  # of the Helm release
     robot: int | None = None  # number of the robot that is meant in a fleet
+    # Of a patient release: receives the error of a request that is sent again.
+    notify: Callable[[str], None] | None = field(default=None, compare=False)
 
     def __str__(self) -> str:
         return f"release '{self.name}' {self.where}"
@@ -137,6 +159,8 @@ class Release:
     def request(self, verb: str, kind: str, **arguments: Any) -> Any:
         """Send a request about objects in the release's namespace; return the client's answer.
 
+        A patient release sends a request without an answer again.
+
         Args:
             verb: "list" or, in all namespaces, "list all", which return a list; or "get", "create"
                 or "delete".
@@ -146,6 +170,27 @@ class Release:
         Raises:
             ClusterError: If the API server denies it or does not answer.
         """
+        until, failed = time.monotonic() + PATIENCE, False
+        while True:
+            try:
+                return self._request(verb, kind, **arguments)
+            except NoAnswerError as error:
+                if self.notify is None or time.monotonic() > until:
+                    raise
+                if not failed:
+                    self.notify(f"{error}; trying again for {PATIENCE:g} s")
+                failed = True
+            except (ExistsError, NotFoundError):
+                # A request without an answer may have created or deleted the object.
+                if failed and verb == "create":
+                    return self._request("get", kind, name=arguments["body"]["metadata"]["name"])
+                if failed and verb == "delete":
+                    return None
+                raise
+            time.sleep(PAUSE)
+
+    def _request(self, verb: str, kind: str, **arguments: Any) -> Any:
+        """Send a request once; its arguments are those of `request`."""
         from kubernetes import client
 
         name, noun = _KINDS[kind]
@@ -154,12 +199,19 @@ class Release:
         if verb == "list all":
             scope, where = {}, "in all namespaces"
             method = f"list_{noun}_for_all_namespaces"
-        elif kind in ("namespaces", "nodes", "selfsubjectaccessreviews"):
+        elif kind in OF_CLUSTER:
             scope, method = {}, method.replace("_namespaced", "")
         call = getattr(getattr(client, name)(self.client), method)
         with explain_errors(f"{verb.partition(' ')[0]} {kind}", where):
             answer = call(_request_timeout=REQUEST_TIMEOUT, **scope, **arguments)
         return answer.items if verb.startswith("list") else answer
+
+    def patient(self, tell: Callable[[str], None]) -> Release:
+        """Return this release with patience, for what goes on in the cluster without a command.
+
+        A request that gets no answer is sent again for `PATIENCE`; `tell` receives its error.
+        """
+        return replace(self, notify=tell)
 
     def find(self, kind: str, component: str) -> list[Any]:
         """List the objects of one kind, such as "pods", that belong to a component."""
@@ -214,7 +266,7 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
     try:
         yield
     except ApiException as error:
-        kind = {404: NotFoundError, 410: ExpiredError}.get(error.status, ClusterError)
+        kind = ERRORS.get(error.status, ClusterError)
         raise kind(f"cannot {doing} {where}: {_refusal(error, doing)}") from error
     except ValueError as error:  # of the client, which checks an object before it sends it
         words = to_one_line(str(error))

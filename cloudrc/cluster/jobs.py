@@ -222,7 +222,7 @@ def follow(release: Release, name: str, write: Callable[[str], None]) -> Ended:
         ClusterError: If the Job's pod cannot run; the message names the cause.
         JobGoneError: If the Job was deleted, or has ended without a verdict.
     """
-    states, watch = list[Any](), ReleaseWatch(release)
+    states, watch = list[Any](), ReleaseWatch(release.patient(write))
 
     def see_end(pod: Any, state: Any) -> str:
         states.append(state)
@@ -258,7 +258,7 @@ class JobReader:
         node, or if the log of an ended pod cannot be read. `tell` also receives the sentences that
         `look` returns. Without `logs`, no log is read.
         """
-        self._release, self._name, self._tell = release, name, tell
+        self._release, self._name, self._tell = release.patient(tell), name, tell
         self._see_end, self._look, self._logs = see_end, look, logs
         self._told, self._read = set[str](), set[str]()  # sentences; UIDs of pods
         self._read_at = dict[str, float]()  # UID of a running pod -> time of its last read [s]

@@ -28,6 +28,7 @@ def fly_in_pods(
     Raises:
         ClusterError: If a Job fails or yields no row, or if a pod will never run.
     """
+    release = release.patient(tell)
     every = "".join(plan.flights).encode()
     name = f"sweep-{hashlib.sha256(every).hexdigest()[:12]}"
     missing = {flight.key: flight for flight in flights}

@@ -7,7 +7,7 @@ import subprocess
 import pytest
 
 from cloudrc import __version__
-from cloudrc.cluster import batch
+from cloudrc.cluster import batch, client
 from cloudrc.cluster.batch import PodSettings
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import UID_LABEL
@@ -190,3 +190,40 @@ def test_a_field_that_kubernetes_does_not_know_is_named(release):
     pods = PODS._replace(changes={("tolerations",): [{"kee": "x"}]})
     with pytest.raises(ClusterError, match=r"spec.template.spec.tolerations.0.kee Extra inputs"):
         batch.start(release, "sweep-1", b"flights", pods)
+
+
+def test_a_server_that_does_not_answer_for_a_while_ends_no_sweep(
+    started, api, release, monkeypatch
+):
+    """Neither `sweep run` nor `sweep attach`: both read the Job's lines."""
+    monkeypatch.setattr(client, "RETRIES", {**client.RETRIES, "total": 0, "backoff_factor": 0.0})
+    monkeypatch.setattr(client, "PAUSE", 0.0)
+    add_pod(api, "a", "Succeeded", "row 1\n", state=terminated(0, ""))
+    api.end("sweep-1", "Complete")
+    told = []
+    for plural, code in (("jobs", 503), ("pods", 500)):
+        left = api.away(plural, code, 3)
+        found = [*batch.JobReader(release, "sweep-1", told.append, lambda pod, state: "").read()]
+        assert (found, left) == (["row 1"], [])
+        assert len(told) == 1, "the error is told once"
+        assert "leader changed; trying again for 60 s" in told.pop()
+    monkeypatch.setattr(client, "PATIENCE", -1.0)
+    api.away("jobs", 503, 3)
+    with pytest.raises(ClusterError, match=r"leader changed; Job 'sweep-1' goes on without"):
+        lines(release)
+
+
+@pytest.mark.parametrize(
+    ("message", "remedy", "other"),
+    [
+        ("exceeded quota: small, requested: pods=4", "--shards", "--set-job"),
+        ('violates PodSecurity "restricted"', "--set-job", "--cpu"),
+        ("serviceaccount not found", "delete the Job", "--cpu"),
+    ],
+)
+def test_the_remedy_of_a_sweep_fits_its_cause(started, api, release, message, remedy, other):
+    api.tell_of("jobs", "sweep-1", reason="FailedCreate", message=message)
+    with pytest.raises(ClusterError) as told:
+        lines(release)
+    assert remedy in str(told.value)
+    assert other not in str(told.value)
