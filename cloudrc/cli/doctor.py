@@ -1,4 +1,7 @@
-"""`cloudrc doctor`: check whether this machine can fly; print how to fix each problem."""
+"""`cloudrc doctor`: check whether this machine can fly; print how to fix each problem.
+
+With `--release` it looks at a release in a cluster instead.
+"""
 
 from __future__ import annotations
 
@@ -27,6 +30,11 @@ PROGRAMS = {
 """Program -> its installation page, and the modes that need the program. No mode needs kind,
 because the cluster may be on other machines."""
 MAKE_CLUSTER = "kind create cluster --config kind-config.yaml"
+FIXES = {
+    "survey": "correct the values given to this command",
+    "release": "see all releases: helm list --all-namespaces",
+}
+"""What was asked of a cluster -> what to do if the error does not say it."""
 WORKS = "MuJoCo loads and steps"
 PROGRAM = f"""
 from cloudrc.sim.engine import at_rest, mujoco
@@ -65,6 +73,8 @@ def arguments(parser: Parser) -> None:
     add("--set", "KEY=VALUE", about)
     about = "with --cluster: a file of the chart's values, as in helm install; repeatable"
     add("-f --values", "FILE", about, read=str, many=True)
+    about = "look at an installed release instead: what it suffers from, and what to do"
+    add("--release", "NAME", about)
     add("--context", "NAME", "kubeconfig context (default: current)")
     about = "namespace (default: the context's, or default)"
     add("-n --namespace", "NAME", about)
@@ -73,12 +83,16 @@ def arguments(parser: Parser) -> None:
 
 def execute(options: Options) -> int:
     """Print the results of all checks; return 3 if the requested mode cannot run, else 0."""
-    mode = "cluster" if options.cluster else options.mode
-    checks = list(all_checks(mode, options))
+    mode = "cluster" if options.cluster or options.release else options.mode
+    checks = list(_cluster(options) if options.release else all_checks(mode, options))
     lacking = [each.name for each in checks if each.state == "missing" and mode in each.modes]
     found = [check._asdict() for check in checks]
     document = {"mode": mode, "ready": not lacking, "checks": found}
-    print_result(options.output, document, as_text(mode, checks, lacking))
+    if options.release:
+        text = _release_text(options.release, checks)
+    else:
+        text = as_text(mode, checks, lacking)
+    print_result(options.output, document, text)
     return MissingPrerequisiteError.exit_code if lacking else 0
 
 
@@ -148,19 +162,25 @@ def _cores() -> Check:
 
 def _cluster(options: Options) -> Iterator[Check]:
     """Check whether a kubeconfig is valid and its cluster answers; survey it if asked for."""
-    from cloudrc.cluster.client import connect
+    from cloudrc.cluster.client import DEFAULT_RELEASE, connect
+    from cloudrc.cluster.incidents import find_causes
     from cloudrc.cluster.survey import survey
 
     name = "kubeconfig"
     try:
-        release = connect(options.context, options.namespace)
+        release = connect(options.context, options.namespace, options.release or DEFAULT_RELEASE)
         where = f"context {options.context}" if options.context else "its current context"
         yield _check(name, True, f"{where}, namespace {release.namespace}", "", CLUSTER)
         name = "cluster"
         release.request("list", "pods", limit=1)
         yield _check(name, True, "the API server answers", "", CLUSTER)
-        name = "survey"
-        if options.cluster:
+        name = "release" if options.release else "survey"
+        if options.release:
+            causes = find_causes(release)
+            yield from (Check(*cause, CLUSTER) for cause in causes)
+            if not causes:
+                yield _check(name, True, "its pods are ready, and both ends hear each other", "")
+        elif options.cluster:
             values = [f"--values={path}" for path in options.values]
             values += [f"--set={text}" for text in options.set]
             for finding in survey(release, values):
@@ -168,7 +188,7 @@ def _cluster(options: Options) -> Iterator[Check]:
     except CloudrcError as error:
         found, _, fix = str(error).partition("; ")
         if not fix:
-            fix = MAKE_CLUSTER if name != "survey" else "correct the values given to this command"
+            fix = FIXES.get(name, MAKE_CLUSTER)
         yield _check(name, False, found, fix, CLUSTER)
 
 
@@ -179,6 +199,14 @@ def as_text(mode: str, checks: Sequence[Check], lacking: Sequence[str]) -> str:
     lines = [f"Needed for mode {mode}:", *_lines(needed), "", "Good to know:", *_lines(others), ""]
     can = f"cannot run: {', '.join(lacking)}" if lacking else "can run"
     return "\n".join([*lines, paint(f"Mode {mode} {can}.", "red" if lacking else "green")])
+
+
+def _release_text(name: str, checks: Sequence[Check]) -> str:
+    """Format what was found about a release; the last line counts the causes."""
+    causes = [check for check in checks if check.state != "ok"]
+    told = f"{len(causes)} things to solve" if causes[1:] else "1 thing to solve"
+    last = f"Release {name}: {told if causes else 'nothing to solve'}."
+    return "\n".join([*_lines(checks), "", paint(last, "red" if causes else "green")])
 
 
 def _lines(checks: Sequence[Check]) -> Iterator[str]:

@@ -422,22 +422,23 @@ VERBS: dict[str, tuple[str, Callable[[Options, Api], int | None]]] = {
 def _forwarded_api(options: Options) -> Iterator[Api]:
     """Yield the API of a release, which is reachable over a forwarded port while the block runs.
 
-    If the API does not answer, and after a status, say which containers of the release end.
+    If the API does not answer, and after a status, say what the release suffers from.
     """
     from cloudrc.cluster.client import ClusterError
-    from cloudrc.cluster.incidents import troubles
+    from cloudrc.cluster.incidents import find_causes
     from cloudrc.cluster.missions import release_api
+    from cloudrc.cluster.pods import NotRunningError
 
     release = need_release(options)
     try:
         with release_api(release, given_token(options)) as api:
             yield api
-    except UnreachableError as error:
-        if found := troubles(release):
-            raise ClusterError("; ".join(found)) from error
+    except (UnreachableError, NotRunningError) as error:
+        if causes := find_causes(release, thoroughly=False):
+            raise ClusterError("; ".join(map(str, causes))) from error
         raise
     if options.verb == "status":
-        print_lines(troubles(release), sys.stderr)
+        print_lines(map(str, find_causes(release, thoroughly=False)), sys.stderr)
 
 
 def _run_job(options: Options) -> int:

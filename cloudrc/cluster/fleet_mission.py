@@ -12,12 +12,20 @@ import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
-from http.client import HTTPConnection
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cluster.client import ClusterError, Release, explain_errors, run
+from cloudrc.cluster.client import ClusterError, Release, run
 from cloudrc.cluster.jobs import AT, KILLED_WATCHER, Ended, JobReader
-from cloudrc.cluster.pods import CELL, DATA, INDEX, METRICS, find_pod, list_pods
+from cloudrc.cluster.pods import (
+    CELL,
+    DATA,
+    INDEX,
+    METRICS,
+    find_pod,
+    list_pods,
+    read_page,
+    read_samples,
+)
 from cloudrc.errors import CloudrcError, to_one_line
 
 if TYPE_CHECKING:
@@ -137,20 +145,5 @@ def _read_robots(release: Release) -> dict[int, Metrics]:
             text = read_page(release, pod.metadata.name, METRICS["world"]["world"])
         except ClusterError:
             continue
-        lines = (line.rpartition(" ") for line in text.splitlines() if not line.startswith("#"))
-        values = {name: float(value) for name, _, value in lines}
-        found[int(pod.metadata.labels[INDEX])] = values
+        found[int(pod.metadata.labels[INDEX])] = read_samples(text)
     return found
-
-
-def read_page(release: Release, pod: str, port: int) -> str:
-    """Read the metrics at a port of a pod, over one connection through the API server."""
-    from kubernetes import client, stream
-
-    call = client.CoreV1Api(release.client).connect_get_namespaced_pod_portforward
-    with explain_errors("forward ports", release.where):
-        forward = stream.portforward(call, pod, release.namespace, ports=str(port))
-        connection = HTTPConnection(pod, port)
-        connection.sock = forward.socket(port)
-        connection.request("GET", "/metrics")
-        return connection.getresponse().read().decode()

@@ -24,6 +24,8 @@ from cloudrc.cluster.client import (
     program,
     run,
 )
+from cloudrc.cluster.diagnosis import why_not_ready
+from cloudrc.cluster.incidents import observe
 from cloudrc.cluster.jobs import (
     Ended,
     JobGoneError,
@@ -51,8 +53,6 @@ LOOK_PERIOD = 1.5
 FAILED_LOOKS = 5
 """Number of looks in a row at which a pod fails before it is reported: at first, Kubernetes may not
 yet have made all objects that the pod needs."""
-MISSING = ("not found", "non-existent")
-"""Words of Kubernetes about a volume, such as a Secret, that somebody has to make."""
 FLUSH = 1.0
 """Time after which a recorder has certainly written its buffer of half a second [s]."""
 FETCHES = 4
@@ -117,45 +117,12 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
 
 def _why_not_ready(release: Release) -> tuple[str, str]:
     """Say why the pods of a release are not ready, and why they will never be; "" if not so."""
-    words, never = list[str](), list[str]()
-    for component, workload in pods.workloads(release).items():
-        why, is_fatal = _state(release, component, workload)
+    words, never, objects = list[str](), list[str](), observe(release)
+    for component in objects.workloads:
+        why, is_fatal = why_not_ready(objects, component)
         words += [f"{component}: {why}"] * bool(why)
         never += [f"the {component} pod cannot run: {why}"] * is_fatal
     return "; ".join(words), "; ".join(never)
-
-
-def _state(release: Release, component: str, workload: Any) -> tuple[str, bool]:
-    """Return why a component is not ready ("" if ready), and whether it can never be ready."""
-    for condition in workload.status.conditions or []:  # for example Pod Security or a quota
-        if condition.type == "ReplicaFailure" and condition.status == "True":
-            return str(condition.message), True
-    found = pods.list_pods(release, component)
-    for pod in found:
-        if why := pods.pod_failure(pod):
-            return why, True
-    status, wanted = workload.status, workload.spec.replicas
-    is_observed = (status.observed_generation or 0) >= workload.metadata.generation
-    if not (is_observed and len(found) >= wanted == status.updated_replicas == status.replicas):
-        return "its pod is being created", False
-    states = (_pod_state(release, pod) for pod in found[:wanted])
-    return next((state for state in states if state[0]), ("", False))
-
-
-def _pod_state(release: Release, pod: Any) -> tuple[str, bool]:
-    """Return why a pod is not ready ("" if ready), and whether it can never be ready."""
-    if any(each.type == "Ready" and each.status == "True" for each in pod.status.conditions or []):
-        return "", False
-    failed = pods.events_of(release, pod, "FailedMount") if pod.status.phase == "Pending" else []
-    if failed:
-        return failed[-1], any(words in failed[-1] for words in MISSING)
-    waiting = [each.name for each in pods.container_statuses(pod) if not each.ready]
-    if waiting:
-        return f"container {' and '.join(waiting)} is not ready yet", False
-    if pod.status.phase == "Pending":
-        return "it starts", False
-    # Kubernetes, not the kubelet, has taken the readiness from a pod whose containers are ready.
-    return f"its node '{pod.spec.node_name}' does not answer, see: kubectl get nodes", False
 
 
 def check_can_begin(release: Release) -> None:

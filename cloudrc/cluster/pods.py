@@ -11,15 +11,18 @@ import os
 import re
 import subprocess
 import tempfile
+import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import IO, Any
 
 from cloudrc.cluster.client import (
     REQUEST_TIMEOUT,
+    STOP_LIMIT,
     ClusterError,
     ExpiredError,
     NoAnswerError,
@@ -71,7 +74,13 @@ START_LIMIT = 20.0
 """Time limit for kubectl to start to forward ports [s]."""
 LOOK_PERIOD = 0.05
 """Time between two checks of kubectl's output [s]."""
+FORWARDER = "Kubernetes port forward proxy"
+"""Beginning of the name of the thread of the Kubernetes client that forwards a port."""
 _FORWARDING = re.compile(rb"Forwarding from 127\.0\.0\.1:(\d+) -> (\d+)")
+
+
+class NotRunningError(ClusterError):
+    """Report that a pod does not run, or cannot be reached."""
 
 
 def list_pods(release: Release, component: str) -> list[Any]:
@@ -131,7 +140,7 @@ class PodWatch:
 
 
 def find_pod(release: Release, component: str) -> Any:
-    """Find the newest running pod of a component; else raise a ClusterError with the cause."""
+    """Find the newest running pod of a component; else raise a NotRunningError with the cause."""
     pods = list_pods(release, component)
     if (robots := len({pod.metadata.labels.get(INDEX) for pod in pods})) > 1:
         raise StateError(f"{release} has {robots} robots; name one: --robot K")
@@ -140,7 +149,7 @@ def find_pod(release: Release, component: str) -> Any:
             return pod
     kind, workload = find_workload(release, component)
     why = (pod_failure(pods[0]) or f"it is {pods[0].status.phase}") if pods else "there is none"
-    raise ClusterError(
+    raise NotRunningError(
         f"the {component} pod of {release} does not run: {why}; "
         f"see: {release.kubectl} describe {kind.lower()} {workload.metadata.name}"
     )
@@ -203,7 +212,7 @@ def _container_failure(status: Any) -> str:
         return (
             f"the image {status.image} of {container} is not on the node and cannot be pulled "
             f"({reason}); name one that the nodes can pull: --set image.registry=... "
-            "--set image.tag=..., or load your own into kind: make kind-load"
+            "--set image.tag=... (a sweep: --image), or load your own into kind: make kind-load"
         )
     if reason in NOT_MADE:
         return f"{container} cannot be created: {to_one_line(waiting.message)}"
@@ -275,7 +284,7 @@ def forwarded(
                 if process.poll() is not None:
                     errors.seek(0)
                     where, why = f"pod '{pod}' {release.where}", last_words(errors.read())
-                    raise ClusterError(f"cannot forward ports of {where}: {why}")
+                    raise NotRunningError(f"cannot forward ports of {where}: {why}")
                 if time.monotonic() > until:
                     raise TimedOutError(
                         f"kubectl port-forward to pod '{pod}' has not started within "
@@ -357,3 +366,30 @@ def pod_log(release: Release, pod: str, container: str, last: int | None = None)
     """Return the log of a container; with `last`, return only the log of the last `last` [s]."""
     since = {} if last is None else {"since_seconds": last}
     return str(release.request("get", "pods/log", name=pod, container=container, **since))
+
+
+def read_page(release: Release, pod: str, port: int) -> str:
+    """Read the metrics at a port of a pod, over one connection through the API server."""
+    from kubernetes import client, stream
+
+    call = client.CoreV1Api(release.client).connect_get_namespaced_pod_portforward
+    with explain_errors("forward ports", release.where):
+        forward = stream.portforward(call, pod, release.namespace, ports=str(port))
+        connection = HTTPConnection(pod, port)
+        connection.sock = forward.socket(port)
+        connection.sock.settimeout(REQUEST_TIMEOUT)
+        try:
+            connection.request("GET", "/metrics")
+            return connection.getresponse().read().decode()
+        finally:
+            connection.close()  # so that the client's thread ends
+            for thread in threading.enumerate():
+                if thread.name.startswith(FORWARDER):
+                    thread.join(STOP_LIMIT)
+            forward.websocket.shutdown()  # the thread does not, if the server ends first
+
+
+def read_samples(text: str) -> dict[str, float]:
+    """Parse a page of metrics: name with labels, as in `name{label="value"}` -> value."""
+    lines = (line.rpartition(" ") for line in text.splitlines() if not line.startswith("#"))
+    return {name: float(value) for name, _, value in lines}
