@@ -1,8 +1,8 @@
-"""Survey a cluster before an install: permissions, admission, quota, nodes, images.
+"""Survey a cluster before an install: permissions, values, admission, quota, nodes, images, DNS.
 
 The pods of the chart are sent to the API server as a dry run, so that Pod Security, LimitRanges and
 quotas judge them themselves. A small pod on each node, which is deleted again, shows whether the
-images are there.
+images are there and whether names are resolved.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from math import ceil
-from typing import Any, Literal, NamedTuple
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
 
 import yaml
 
@@ -24,9 +26,10 @@ from cloudrc.cluster.client import (
     chart_folder,
     run,
 )
-from cloudrc.cluster.pods import pod_failure
+from cloudrc.cluster.diagnosis import DNS_REMEDY, LOOK_UP, Finding, remedy
+from cloudrc.cluster.pods import container_statuses, pod_failure
 from cloudrc.cluster.releases import COMPONENT
-from cloudrc.errors import to_one_line
+from cloudrc.errors import BadInputError, to_one_line
 
 NEEDED = {
     "": "pods services configmaps secrets serviceaccounts persistentvolumeclaims",
@@ -44,6 +47,27 @@ ALSO = (
     ("", "list", "events"),
 )
 """Further permissions, of the commands that fly and look: API group, verb, object."""
+CONFIGURED = "experiment.yaml", "profile.yaml"
+"""Keys of the chart's ConfigMaps: the experiment, and the profile of the link."""
+NAMED = {
+    "configMap": ("ConfigMap", "name", "configmaps", "robot.configMap, scene.configMap"),
+    "secret": (
+        *("Secret", "secretName", "secrets"),
+        "secret.existingSecret, teleop.tokens.existingSecret",
+    ),
+    "persistentVolumeClaim": (
+        *("PersistentVolumeClaim", "claimName", "persistentvolumeclaims"),
+        "recordings.existingClaim, teleop.journal.existingClaim",
+    ),
+}
+"""Kind of a pod's volume -> kind of the object that it names, key of the name, kind of objects in
+requests, and the values that name one of the user."""
+DEFAULT_CLASS = "storageclass.kubernetes.io/is-default-class"
+"""Annotation of the StorageClass of claims that name none."""
+IN_CLUSTER = "kubernetes.default.svc"
+"""A name that each cluster resolves."""
+LOOKS_UP = ["python", "-I", "-S", "-c", LOOK_UP, IN_CLUSTER]
+"""Command of a container that fails if it cannot resolve this name."""
 PROBE_LIMIT = 60.0
 """Time limit for the probe of all nodes [s], in which a node may pull both images."""
 LOOK_PERIOD = 0.5
@@ -62,18 +86,6 @@ RESTRICTED = {
 """Rights of each container of a probe: every level of Pod Security admits them."""
 
 
-class Finding(NamedTuple):
-    """What the survey found about one thing, and how to solve a problem.
-
-    "missing" stops an install, "warn" does not.
-    """
-
-    name: str
-    state: Literal["ok", "warn", "missing"]
-    found: str
-    fix: str = ""
-
-
 def survey(release: Release, values: Sequence[str] = ()) -> Iterator[Finding]:
     """Check whether the chart can be installed as this release; yield one finding after another.
 
@@ -85,6 +97,9 @@ def survey(release: Release, values: Sequence[str] = ()) -> Iterator[Finding]:
         return
     rendered = render_chart(release, values)
     pods = pods_of_chart(rendered)
+    yield from experiments(rendered)
+    yield from named_objects(release, rendered, pods)
+    yield from storage_classes(release, rendered)
     for component, spec in pods.items():
         yield admission(release, component, spec)
     yield from quotas(release, pods, counts_of_chart(rendered))
@@ -139,6 +154,84 @@ def counts_of_chart(rendered: list[Any]) -> Counter[str]:
     return Counter({name: spec["replicas"] for name, spec in _specs(rendered).items()})
 
 
+def experiments(rendered: list[Any]) -> Iterator[Finding]:
+    """Load the experiment and the link of the chart, as the pods will."""
+    from cloudrc.config.load import load_experiment, load_link
+    from cloudrc.config.resolved import absolute_paths
+
+    files = dict[str, str]()
+    for thing in rendered:
+        if thing["kind"] == "ConfigMap":
+            files |= {key: thing["data"][key] for key in CONFIGURED if key in thing["data"]}
+    if len(files) < len(CONFIGURED):
+        return
+    experiment, profile = CONFIGURED
+    if paths := absolute_paths(yaml.safe_load(files[experiment])):
+        yield Finding("experiment", "ok", f"{', '.join(paths)}: files of the pods, not looked at")
+        return
+    with TemporaryDirectory(prefix="cloudrc-") as name:
+        folder = Path(name)
+        for key, text in files.items():
+            (folder / key).write_text(text, encoding="utf-8")
+        try:
+            load_experiment(folder / experiment)
+            load_link(folder / profile, folder / experiment)
+        except BadInputError as error:
+            text = to_one_line(str(error).replace(f"{folder}/", ""))
+            fix = "correct it in the values, below experiment or link"
+            yield Finding("experiment", "missing", text, fix)
+            return
+    yield Finding("experiment", "ok", "can be flown")
+
+
+def named_objects(
+    release: Release, rendered: list[Any], pods: dict[str, dict[str, Any]]
+) -> Iterator[Finding]:
+    """Look for the objects that the pods mount and that the chart does not make."""
+    made = {(thing["kind"], thing["metadata"]["name"]) for thing in rendered}
+    volumes = [volume for spec in pods.values() for volume in spec.get("volumes", [])]
+    for source, (kind, key, plural, values) in NAMED.items():
+        given = [volume[source] for volume in volumes if source in volume]
+        names = {each[key] for each in given if not each.get("optional")}
+        for name in sorted(name for name in names if (kind, name) not in made):
+            try:
+                release.request("get", plural, name=name)
+                yield Finding(f"{kind} {name}", "ok", "exists")
+            except NotFoundError:
+                text = f"there is none {release.where}"
+                fix = f"make it, or correct the value that names it: {values}"
+                yield Finding(f"{kind} {name}", "missing", text, fix)
+            except ClusterError as error:
+                yield Finding(f"{kind} {name}", "warn", f"not looked at: {error}")
+
+
+def storage_classes(release: Release, rendered: list[Any]) -> Iterator[Finding]:
+    """Look for the StorageClasses of the claims that the chart makes."""
+    claims = [thing for thing in rendered if thing["kind"] == "PersistentVolumeClaim"]
+    for spec in _specs(rendered).values():
+        claims += spec.get("volumeClaimTemplates", [])
+    if not claims:
+        return
+    try:
+        found = release.request("list", "storageclasses")
+    except ClusterError:
+        yield Finding("StorageClass", "warn", "you may not list StorageClasses: not looked at")
+        return
+    there = {each.metadata.name for each in found}
+    if any((each.metadata.annotations or {}).get(DEFAULT_CLASS) == "true" for each in found):
+        there.add(None)
+    names = {claim["spec"].get("storageClassName") for claim in claims} - {""}  # "": none is asked
+    for name in names - there:
+        of = f"StorageClass '{name}'" if name else "default StorageClass"
+        known = ", ".join(sorted(filter(None, there))) or "none"
+        fix = (
+            "name one of the cluster: recordings.storageClassName, teleop.journal.storageClassName"
+        )
+        yield Finding("StorageClass", "missing", f"no {of}; there are: {known}", fix)
+    if names <= there:
+        yield Finding("StorageClass", "ok", "that of each claim exists")
+
+
 def admission(release: Release, component: str, spec: dict[str, Any]) -> Finding:
     """Send a pod of the chart as a dry run: nothing is created."""
     name = f"{component} pod"
@@ -148,8 +241,9 @@ def admission(release: Release, component: str, spec: dict[str, Any]) -> Finding
         fix = f"make the namespace: kubectl create namespace {release.namespace}"
         return Finding(name, "missing", to_one_line(str(error)), fix)
     except ClusterError as error:
-        fix = "set other values: link.mode=relay for Pod Security, smaller resources for a quota"
-        return Finding(name, "missing", to_one_line(str(error)), fix)
+        text = to_one_line(str(error))
+        fix = remedy(text, "set other values, such as smaller resources of the containers")
+        return Finding(name, "missing", text, fix)
     return Finding(name, "ok", "is admitted: Pod Security, LimitRanges and quota agree")
 
 
@@ -252,7 +346,8 @@ def start_probe(release: Release, node: str, pods: dict[str, dict[str, Any]]) ->
             "name": component,
             "image": pod["containers"][0]["image"],
             "imagePullPolicy": "IfNotPresent",
-            "command": ["true"],
+            "command": LOOKS_UP if component == "cloud" else ["true"],
+            "terminationMessagePolicy": "FallbackToLogsOnError",
             "resources": RESOURCES,
             "securityContext": RESTRICTED,
         }
@@ -276,8 +371,20 @@ def _finding(release: Release, node: str, pod: str, until: float) -> Finding:
         if found.status.phase == "Succeeded":
             return Finding(name, "ok", "has the images")
         if found.status.phase == "Failed":
-            return Finding(name, "missing", "its probe failed", f"kubectl describe pod {pod}")
+            return _failed_probe(release, name, found)
         if why := pod_failure(found):
             return Finding(name, "missing", why, "make kind-load, or --set image.registry=...")
         time.sleep(LOOK_PERIOD)
     return Finding(name, "warn", why or "its probe has not ended", "kubectl get events")
+
+
+def _failed_probe(release: Release, node: str, pod: Any) -> Finding:
+    """Say why the probe of a node has failed."""
+    ends = [each.state.terminated for each in container_statuses(pod)]
+    words = [to_one_line(end.message) for end in ends if end and end.exit_code]
+    if not any(text.startswith(IN_CLUSTER) for text in words):
+        return Finding(node, "missing", f"its probe failed: {'; '.join(words)}")
+    # A policy of the namespace may refuse the probe what the chart's policies allow to its pods.
+    state: Literal["warn", "missing"]
+    state = "warn" if release.request("list", "networkpolicies") else "missing"
+    return Finding(node, state, f"a pod there cannot resolve a name: {words[0]}", DNS_REMEDY)

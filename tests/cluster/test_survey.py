@@ -3,7 +3,7 @@
 import pytest
 
 from cloudrc.cluster import survey
-from tests.cluster.conftest import pod, waiting
+from tests.cluster.conftest import pod, terminated, waiting
 
 CHART = """\
 apiVersion: apps/v1
@@ -16,8 +16,28 @@ spec:
       serviceAccountName: made-by-the-chart
       initContainers: [{name: link, image: i, resources: {requests: {cpu: 20m}}}]
       containers: [{name: COMPONENT, image: i, resources: {requests: {cpu: 60m}}}]
+      volumes:
+      - {name: data, persistentVolumeClaim: {claimName: CLAIM}}
+      - {name: secret, secret: {secretName: of-the-chart}}
 ---
 """
+FILES = """\
+apiVersion: v1
+kind: ConfigMap
+metadata: {name: files}
+data: {experiment.yaml: "cloud: {predictor: PREDICTOR}", profile.yaml: "profile: null"}
+---
+apiVersion: v1
+kind: Secret
+metadata: {name: of-the-chart}
+---
+apiVersion: v1
+kind: PersistentVolumeClaim
+metadata: {name: journal}
+spec: {storageClassName: CLASS}
+---
+"""
+SETTINGS = {"CLAIM": "journal", "PREDICTOR": "kalman", "CLASS": "gold"}
 SECURITY = 'pods "x" is forbidden: violates PodSecurity "restricted:latest"'
 
 
@@ -25,6 +45,7 @@ SECURITY = 'pods "x" is forbidden: violates PodSecurity "restricted:latest"'
 def cluster(api, pretend, monkeypatch):
     """The fake API server, on which pods of the survey run and end."""
     pretend_chart(pretend)
+    api.put("storageclasses", {"metadata": {"name": "gold"}, "provisioner": "x"})
     monkeypatch.setattr(survey, "LOOK_PERIOD", 0.01)
     put = api.put
     api.ended = {"phase": "Succeeded"}
@@ -39,10 +60,12 @@ def cluster(api, pretend, monkeypatch):
     return api
 
 
-def pretend_chart(pretend, robots=1):
+def pretend_chart(pretend, robots=1, **settings):
     """Let `helm` render a chart whose world and cloud have a pod for each robot."""
     chart = CHART.replace("REPLICAS", str(robots))
-    rendered = "".join(chart.replace("COMPONENT", each) for each in ("world", "cloud"))
+    rendered = FILES + "".join(chart.replace("COMPONENT", each) for each in ("world", "cloud"))
+    for name, value in (SETTINGS | settings).items():
+        rendered = rendered.replace(name, value)
     pretend("helm", f"cat <<'END'\n{rendered}END")
 
 
@@ -53,9 +76,10 @@ def found(release):
 def test_a_cluster_that_is_fit_has_no_problem_and_keeps_no_pod(cluster, release):
     cluster.put("nodes", {"metadata": {"name": "two"}, "spec": {}})
     seen = found(release)
-    checks = ["permissions", "world pod", "cloud pod", "node one", "node two"]
+    checks = ["permissions", "experiment", "StorageClass", "world pod", "cloud pod"]
+    checks += ["node one", "node two"]
     assert list(seen) == checks
-    assert {one.state for one in seen.values()} == {"ok"}
+    assert [one for one in seen.values() if one.state != "ok"] == []
     assert seen["node two"].found == "has the images"
     assert not [name for kind, name in cluster.objects if kind == "pods"]
 
@@ -94,3 +118,34 @@ def test_a_quota_is_compared_with_all_pods_together(
     assert f"needs {enough} requests.cpu: 0 of {less} are used" in seen.found
     status["hard"]["requests.cpu"] = enough
     assert found(release)["quota small"].state == "ok"
+
+
+@pytest.mark.parametrize(
+    ("settings", "name", "words"),
+    [
+        ({"CLAIM": "nothere"}, "PersistentVolumeClaim nothere", "recordings.existingClaim"),
+        ({"PREDICTOR": "nope"}, "experiment", "cloud.predictor: no predictor named 'nope'"),
+        ({"CLASS": "tin"}, "StorageClass", "no StorageClass 'tin'; there are: gold"),
+    ],
+)
+def test_values_that_cannot_run_are_told_with_their_remedy(
+    cluster, release, pretend, settings, name, words
+):
+    pretend_chart(pretend, **settings)
+    seen = found(release)[name]
+    assert seen.state == "missing"
+    assert words in f"{seen.found}; {seen.fix}"
+    cluster.put("persistentvolumeclaims", {"metadata": {"name": "nothere"}, "spec": {}})
+    cluster.put("storageclasses", {"metadata": {"name": "tin"}, "provisioner": "x"})
+    assert (found(release)[name].state == "ok") == ("PREDICTOR" not in settings)
+
+
+def test_a_dns_without_pods_is_told_unless_a_policy_may_refuse_the_probe(cluster, release):
+    message = "kubernetes.default.svc: Temporary failure in name resolution"
+    ended = pod("one", "cloud", state=terminated(1, message), phase="Failed")
+    cluster.ended = ended["status"]
+    seen = found(release)["node one"]
+    assert (seen.state, "k8s-app=kube-dns" in seen.fix) == ("missing", True)
+    assert message in seen.found
+    cluster.put("networkpolicies", {"metadata": {"name": "deny"}})
+    assert found(release)["node one"].state == "warn"
