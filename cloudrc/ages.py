@@ -5,6 +5,7 @@ The delays are those of the flight, because link and cloud draw the same random 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -12,9 +13,9 @@ from numpy.typing import NDArray
 
 from cloudrc.assembly import build_compute_time
 from cloudrc.config.robot import known_robot
+from cloudrc.config.time_line import find_ways
 from cloudrc.link.draws import BLOCK, OVERTAKES, impairments, stream_key
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.traces import link_profile
 from cloudrc.messages import NEVER_NS, plan_length
 from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES, Kind
 
@@ -102,11 +103,11 @@ def _cross(
     `begun_ns` are the times at which their end began to make them, `sent_ns` those of sending [ns].
     """
     uplink = kind is Kind.TELEMETRY
-    way = experiment.uplink if uplink else experiment.downlink
     rate_hz = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
     numbers = (begun_ns // round(1e9 / rate_hz)).tolist()
-    profile = link_profile(way.model_copy(update={"blackouts": (), "corrupt": 0.0}))
-    link = LinkDirection(profile, experiment.seed, uplink, stream=experiment.stream)
+    *ways, start_ns = find_ways(experiment)
+    profile = replace(ways[0 if uplink else 1], blackouts=(), corrupt=0.0)
+    link = LinkDirection(profile, experiment.seed, uplink, -start_ns, stream=experiment.stream)
     if (only := link.only) is not None:  # nearly all links: a call per block of packets
         key = stream_key(experiment.seed, uplink, 1, kind, experiment.stream)
         blocks = range(numbers[-1] // BLOCK + 1 if numbers else 0)

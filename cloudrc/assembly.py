@@ -29,13 +29,13 @@ from cloudrc.config.resolved import ResolvedExperiment, ResolvedGuard
 from cloudrc.config.robot import RobotFacts, facts, is_planar
 from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
+from cloudrc.config.time_line import find_ways
 from cloudrc.errors import ControllerLostError
 from cloudrc.geometry.fence import Fence
 from cloudrc.link.cell import FRAME_NS, Bulk, Cell, Video
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DIRECTIONS
 from cloudrc.link.queue import PacketQueue
-from cloudrc.link.traces import link_profile
 from cloudrc.messages import Start
 from cloudrc.outside.code import apart
 from cloudrc.outside.reuse import reuse_results
@@ -306,14 +306,14 @@ def _facts_of(experiment: ResolvedExperiment) -> RobotFacts:
 def build_links(
     experiment: ResolvedExperiment, origin_ns: int = 0
 ) -> tuple[LinkDirection, LinkDirection]:
-    """Build the uplink and the downlink of the link; their time lines begin at `origin_ns` [ns]."""
-    up, down = map(link_profile, (experiment.uplink, experiment.downlink))
+    """Build the uplink and the downlink of the link, which come up at `origin_ns` [ns]."""
+    up, down, start_ns = find_ways(experiment)
     if experiment.cell.rate_kbit is not None:  # packets get their order behind the cell
         up, down = replace(up, keep_order=False), replace(down, keep_order=False)
     seed, stream = experiment.seed, experiment.stream
     return (
-        LinkDirection(up, seed, uplink=True, origin_ns=origin_ns, stream=stream),
-        LinkDirection(down, seed, uplink=False, origin_ns=origin_ns, stream=stream),
+        LinkDirection(up, seed, uplink=True, origin_ns=origin_ns - start_ns, stream=stream),
+        LinkDirection(down, seed, uplink=False, origin_ns=origin_ns - start_ns, stream=stream),
     )
 
 

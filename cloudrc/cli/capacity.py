@@ -70,7 +70,7 @@ def execute(options: Options) -> None:
     require("a capacity", MODES["virtual"])
     asked = settings_from(options, Sought)
     conditions = asked.conditions()
-    warn(*(each.fleet for each in conditions))
+    warn(*(each.fleet for each in conditions), seeds=options.seeds)
     name = conditions[0].fleet.name
     with results_folder(options.out, "capacity", name) as folder, Progress("flies") as view:
         view.say(f"{options.experiment}: how many robots? seeds 1 to {options.seeds}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cloudrc.cli.parser import Options, Parser, flags
+from cloudrc.errors import BadInputError
 from cloudrc.outside.paths import check_new
 
 EPILOG = """\
@@ -21,6 +22,9 @@ sources:
   a CSV file    columns time_s and delay_ms (units: _s, _ms, _us or _ns);
                 rtt_ms with --halve-rtt; a loss: lost = 1, received = 0, or an
                 empty delay
+  FILE.up, FILE.down
+                a capacity trace of mahimahi: FILE of -o becomes a profile whose
+                rate_trace replays it
 
 examples:
   cloudrc link record runs/latest -o trace.csv
@@ -43,9 +47,16 @@ def arguments(parser: Parser) -> None:
 
 def execute(options: Options) -> None:
     """Read the delays from SOURCE, write a trace per direction, and print a summary of each."""
+    from cloudrc.runs.links.rates import is_capacity, write_rate_profile
     from cloudrc.runs.links.trace import read_packets, write_trace_file
 
     source, output = options.source, options.output
+    if is_capacity(source):
+        if options.halve_rtt:
+            raise BadInputError(f"{source}: has no round trips; leave out --halve-rtt")
+        check_new(output)
+        print("\n".join(write_rate_profile(source, output, options.direction)))
+        return
     found = read_packets(source, options.direction, halve=options.halve_rtt)
     paths = {
         way: output.with_stem(f"{output.stem}-{way}") if len(found) > 1 else output for way in found

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.compare import flight_arguments
-from cloudrc.cli.output import output_argument, print_result
+from cloudrc.cli.output import output_argument, print_result, tell_seeds
 from cloudrc.cli.parser import Options, Parser, flags, number
 from cloudrc.text import escape
 
@@ -48,6 +48,9 @@ def execute(options: Options) -> int:
 
     asked = options.key, options.experiment, options.set, options.seeds
     margin = Margin(Asked(*asked, options.max, options.resolution))
+    present, _ = margin.experiment(margin.present)
+    assert present is not None, "the search begins with a value that flies"
+    tell_seeds(options.seeds, present)
     with Progress("flies") as view:
         for name in margin.questions:
             _search(options, margin, name, view.say)

@@ -192,13 +192,22 @@ def again(out: Path | None, folder: Path) -> str:
 
 def warn_about(plan: SweepPlan) -> None:
     """Print warnings about the points of a plan on stderr, and where the speed cap changes."""
-    warn(*plan.points)
+    warn(*plan.points, seeds=len(plan.draft.seeds))
     if plan.speed_caps:
         tell(plan.speed_caps)
 
 
-def warn(*experiments: ResolvedExperiment) -> None:
-    """Print warnings about experiments on stderr."""
+def warn(*experiments: ResolvedExperiment, seeds: int = 1) -> None:
+    """Print warnings about experiments that fly with so many seeds on stderr."""
     from cloudrc.runs.experiment import advice_on
 
     print_lines((f"cloudrc: warning: {text}" for text in advice_on(*experiments)), sys.stderr)
+    tell_seeds(seeds, *experiments)
+
+
+def tell_seeds(seeds: int, *experiments: ResolvedExperiment) -> None:
+    """Say if several seeds fly over one and the same part of a time line."""
+    from cloudrc.config.time_line import describe_one_time_line
+
+    if text := describe_one_time_line(seeds, *experiments):
+        tell(text)

@@ -59,7 +59,7 @@ def execute(options: Options) -> int:
     study = settings_from(options, PlaceStudy)
     with Progress("checks the flights"):
         points = study.plan()
-    warn(*(trials[0].resolved for trials in points))
+    warn(*(trials[0].resolved for trials in points), seeds=study.seeds)
     name = points[0][0].resolved.name
     with results_folder(options.out, "place", name) as folder:
         rows = Rows(folder)

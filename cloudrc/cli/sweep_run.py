@@ -233,7 +233,7 @@ def fly_seeds(options: Options) -> int:
     plan = check(draft_of(options.experiment, options.set, options.seeds))
     (experiment,), count = plan.points, len(plan.flights)
     check_mode(experiment, "virtual")
-    warn(experiment)
+    warn(experiment, seeds=count)
     folder = new_folder(options.out, f"{plan.name}-virtual-{count}seeds", "latest-sweep")
     rows = sweep.begin(folder, plan)
     head = f"{plan.name}: mode virtual, seeds 1 to {count}, {experiment.network}"

@@ -11,11 +11,12 @@ from cloudrc.config.overrides import Settings
 from cloudrc.config.profile import DIRECTIONS, ChangeConfig, check_profile, load_profile
 from cloudrc.errors import BadInputError
 from cloudrc.link.doubts import describe_heavy_loss
+from cloudrc.link.profile import PERIOD_KEYS
 from cloudrc.outside.document import Document
 
 CHANGEABLE_KEYS = ChangeConfig.model_fields.keys() - {"at_s"}
 """Keys of a direction that an entry of its list `changes` may set."""
-TIME_LINE_KEYS = ("changes", "trace", "blackouts")
+TIME_LINE_KEYS = ("changes", "trace", "blackouts", "rate_trace", "loop", "repeat_s")
 """Keys of a direction that make up its time line: how the link's conditions change over time."""
 _SETTING = "downlink.delay_ms=120"
 _EXAMPLE = f"for example {_SETTING}, or --profile handover"
@@ -54,6 +55,9 @@ def edit_profile(
     changes: Settings = {}
     for path, setting in overrides.parse_settings(settings, command, _SETTING).items():
         way, *keys = path[1:] if path[0] == "link" else path
+        if (way, keys) == ("start_s", []):
+            changes[(way,)], restart = setting, True
+            continue
         if not keys or way not in DIRECTIONS:
             raise BadInputError(f"{'.'.join(path)}: set a key of uplink or downlink, {_EXAMPLE}")
         changes[way, *keys] = setting
@@ -78,6 +82,8 @@ def _drop_from_time_line(document: Document, way: str, key: str) -> list[str]:
         notes.append(f"the time line of the {way} no longer changes {key}")
     if key == "delay_ms" and direction.pop("trace", None) is not None:
         notes.append(f"the {way} no longer follows its trace")
+        if not any(direction.get(each) for each in PERIOD_KEYS):
+            direction.pop("loop", None)
     elif key == "loss" and direction.get("trace"):
         notes.append(f"if the trace of the {way} has a column loss, it still sets the loss")
     return notes

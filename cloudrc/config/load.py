@@ -25,6 +25,7 @@ from cloudrc.config.place import PlaceFile
 from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.profile import (
     DIRECTIONS,
+    LATER_KEYS,
     DirectionConfig,
     Profile,
     check_profile,
@@ -67,6 +68,7 @@ _SECTIONS = ("world", "guard", "link", "cloud", "report")
 """Sections that may be null, and get values."""
 _PLACE, _PROFILE = ("cloud", "place"), ("link", "profile")
 """Keys of the names of files; the kind of file is called as its key."""
+_START = ("link", "start_s")
 _PROFILE_KEYS = {("link",), _PROFILE, _PLACE}
 """If a setting gives one of these keys, it replaces the whole link profile."""
 _OF_ALL = "fleet", "cell", "cloud.cores", "cloud.sharing", "cloud.place"
@@ -275,7 +277,7 @@ def _link_of(document: Document, name: str) -> Profile:
     _inline_link(document, found)
     found += _resolve_paths(document)
     link = problems.validate(document, Experiment, name, found).link
-    return Profile(uplink=link.uplink, downlink=link.downlink)
+    return Profile(uplink=link.uplink, downlink=link.downlink, start_s=link.start_s)
 
 
 def _is_inside_name(path: KeyPath) -> bool:
@@ -358,6 +360,7 @@ def _inline_profile(document: Document) -> None:
         file, profile = _read_named(document, _PROFILE, Profile)
         for way in DIRECTIONS:
             _inline_direction(document, way, file)
+        _default(document, _START, profile.start_s)
     for path, value in _implied(profile).items():
         _default(document, path, value)
 
@@ -400,9 +403,8 @@ def _implied(profile: Profile) -> dict[KeyPath, float]:
 def _has_all_values(document: Document) -> bool:
     """Whether the file sets all keys of both link directions, as a resolved experiment does."""
     given = [document.get("link", way) for way in DIRECTIONS]
-    return all(
-        isinstance(one, dict) and one.keys() >= DirectionConfig.model_fields.keys() for one in given
-    )
+    needed = DirectionConfig.model_fields.keys() - {*LATER_KEYS}
+    return all(isinstance(one, dict) and one.keys() >= needed for one in given)
 
 
 def _plan_max(document: Document) -> float:
@@ -427,7 +429,8 @@ def _remove_derived(document: Document, name: str, *, new_profile: bool) -> None
         age_max = guard.command_age_max_ms or COMMAND_AGE_MAX_MS
         derived["guard", "speed_max_mps"] = speed_cap(age_max, guard.plan_max_s or 0.0, bounds)
     if new_profile:
-        derived |= _implied(_present(document, _PROFILE, Profile)) | _computer(document)
+        present = _present(document, _PROFILE, Profile)
+        derived |= _implied(present) | _computer(document) | {_START: present.start_s}
         for way in DIRECTIONS:
             del document.tree["link"][way]
     for (section, key), value in derived.items():

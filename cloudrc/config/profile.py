@@ -7,23 +7,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Discriminator, Tag, model_validator
 
 from cloudrc.config import problems, shipped
 from cloudrc.config.problems import ConfigProblem
-from cloudrc.config.section import Section
+from cloudrc.config.section import Section, leave_out_null
+from cloudrc.errors import BadInputError
+from cloudrc.link.opportunities import read_opportunities
 from cloudrc.link.profile import CLOUD_TIME_MAX as CLOUD_TIME_MAX
 from cloudrc.link.profile import COMMAND_AGE_MS as COMMAND_AGE_MS
 from cloudrc.link.profile import DIRECTIONS as DIRECTIONS
+from cloudrc.link.profile import RANDOM as RANDOM
 from cloudrc.link.profile import (
     Blackout,
     Change,
     DirectionKeys,
     GilbertElliott,
+    NotNegative,
     Probability,
     ProfileKeys,
+    refuse_period,
 )
 from cloudrc.link.profile import CloudTime as CloudTime
 from cloudrc.link.profile import CommandAge as CommandAge
@@ -31,11 +36,17 @@ from cloudrc.link.traces import read_table, read_trace
 from cloudrc.outside.document import Document, KeyPath
 from cloudrc.outside.reuse import reuse
 
-FILE_READERS: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
+FILE_READERS: dict[str, Callable[[Path], object]] = {
+    "trace": read_trace,
+    "table": read_table,
+    "rate_trace": read_opportunities,
+}
 """Key whose value is the path of a data file -> function that reads and checks the file."""
 
 
-_Keys = TypeVar("_Keys", GilbertElliott, DirectionKeys)
+LATER_KEYS = ("rate_trace", "repeat_s")
+"""Keys of a direction that are left out where they are null, as before there were any."""
+_Keys = TypeVar("_Keys", GilbertElliott, DirectionKeys, ProfileKeys)
 
 
 def _refuse_conflict(keys: _Keys) -> _Keys:
@@ -79,6 +90,17 @@ class DirectionConfig(Section, DirectionKeys):
     blackouts: tuple[BlackoutConfig, ...] = ()
 
     _agree = model_validator(mode="after")(_refuse_conflict)
+    _write = leave_out_null(*LATER_KEYS)
+
+
+def _start_tag(value: Any) -> str:
+    return "<word>" if isinstance(value, str) else "<time>"
+
+
+StartConfig = Annotated[
+    Annotated[NotNegative, Tag("<time>")] | Annotated[Literal["random"], Tag("<word>")],
+    Discriminator(_start_tag),
+]
 
 
 class Profile(Section, ProfileKeys):
@@ -86,6 +108,9 @@ class Profile(Section, ProfileKeys):
 
     uplink: DirectionConfig = DirectionConfig()
     downlink: DirectionConfig = DirectionConfig()
+    start_s: StartConfig | None = None
+
+    _agree = model_validator(mode="after")(_refuse_conflict)
 
 
 def load_profile(name: str | Path) -> Profile:
@@ -110,8 +135,17 @@ def resolve_files(document: Document, above: KeyPath = ()) -> list[ConfigProblem
             with problems.collect(found, path):
                 file = source.absolute(name)
                 _check_file(path[-1], file)
+                if path[-1] == "trace":
+                    _check_period(document.get(*path[:-1], "repeat_s"), file)
                 document.set_value(path, str(file), source)
     return found
+
+
+def _check_period(period: Any, trace: Path) -> None:
+    if isinstance(period, float | int):
+        last = reuse(("last row", trace), lambda: read_trace(trace).times[-1])
+        if text := refuse_period(period, last):
+            raise BadInputError(text)
 
 
 def _check_file(key: str, path: Path) -> None:

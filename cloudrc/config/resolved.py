@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from pydantic import Field, ValidationInfo, ValidatorFunctionWrapHandler, field_validator
 
-from cloudrc.config.profile import DIRECTIONS, CloudTime, CommandAge, DirectionConfig
+from cloudrc.config.profile import DIRECTIONS, RANDOM, CloudTime, CommandAge, DirectionConfig
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, known_robot
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import (
@@ -140,12 +140,17 @@ class ResolvedExperiment(Experiment):
     @property
     def uplink(self) -> DirectionConfig:
         """Conditions of the link from world to cloud."""
-        return self.link.uplink
+        return self._acting(self.link.uplink)
 
     @property
     def downlink(self) -> DirectionConfig:
         """Conditions of the link from cloud to world."""
-        return self.link.downlink
+        return self._acting(self.link.downlink)
+
+    def _acting(self, way: DirectionConfig) -> DirectionConfig:
+        """Return a direction whose time line goes round if it begins at random."""
+        goes_round = self.link.start_s == RANDOM and way.may_repeat
+        return way.model_copy(update={"loop": True}) if goes_round else way
 
     @property
     def network(self) -> str:
@@ -158,7 +163,8 @@ class ResolvedExperiment(Experiment):
     @property
     def link_values(self) -> dict[str, Any]:
         """Content of a profile of this link, without defaults."""
-        return self.link.model_dump(mode="json", include={*DIRECTIONS}, exclude_defaults=True)
+        keys = {*DIRECTIONS, "start_s"}
+        return self.link.model_dump(mode="json", include=keys, exclude_defaults=True)
 
 
 def bounds_of(world: World, *, has_speed: bool = False) -> Bounds:

@@ -25,11 +25,12 @@ from pydantic import (
 
 from cloudrc.config.disturbances import Plant, SensorsConfig, WindConfig
 from cloudrc.config.fleet import CellConfig, FleetConfig
-from cloudrc.config.profile import CloudTime, CommandAge, DirectionConfig
-from cloudrc.config.section import Section
+from cloudrc.config.profile import CloudTime, CommandAge, DirectionConfig, StartConfig
+from cloudrc.config.section import Section, leave_out_null
 from cloudrc.geometry.fence import Corners, order_of
 from cloudrc.link.profile import NotNegative as NotNegative
 from cloudrc.link.profile import Positive as Positive
+from cloudrc.link.profile import refuse_start
 from cloudrc.messages import TOUCH_NAME_MAX
 from cloudrc.policy.address import check_url
 
@@ -320,6 +321,17 @@ class Link(Section):
     """Conditions from world to cloud; a key here overrides the profile"""
     downlink: DirectionConfig = DirectionConfig()
     """Conditions from cloud to world; a key here overrides the profile"""
+    start_s: StartConfig | None = None
+    """Where in the time line of the link the flight begins [s], or random: drawn from the seed, and
+    the line goes round. null: the profile's value, else 0"""
+
+    _write = leave_out_null("start_s")
+
+    @model_validator(mode="after")
+    def _refuse_start(self) -> Link:
+        if text := refuse_start(self.start_s, self.uplink, self.downlink):
+            raise ValueError(text)
+        return self
 
 
 class PlugIn(Section):

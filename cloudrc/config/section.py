@@ -6,8 +6,15 @@ import ast
 import inspect
 from dataclasses import is_dataclass
 from itertools import pairwise
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    GetJsonSchemaHandler,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+)
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -48,6 +55,18 @@ class Described(BaseModel):
             if key in texts:
                 part["description"] = texts[key]
         return schema
+
+
+def leave_out_null(*keys: str) -> Any:
+    """Let a section leave out these keys where they are null, so that its hash stays."""
+
+    def write(self: BaseModel, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        written: dict[str, Any] = handler(self)
+        return {
+            key: value for key, value in written.items() if value is not None or key not in keys
+        }
+
+    return model_serializer(mode="wrap")(write)
 
 
 class Section(Described):

@@ -19,6 +19,7 @@ import numpy as np
 from cloudrc.errors import CloudrcError
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
 from cloudrc.link.profile_file import read_keys
+from cloudrc.link.start import begin
 from cloudrc.link.streams import Stream
 from cloudrc.link.traces import link_profile
 from cloudrc.link.verify import verdict_of
@@ -104,11 +105,13 @@ class LinkMonitor:
             return None
         try:
             keys = read_keys(values)
-            uplink, downlink = (
-                link_profile(k, self._file_max) for k in (keys.uplink, keys.downlink)
+            ways = (
+                link_profile(keys.uplink, self._file_max),
+                link_profile(keys.downlink, self._file_max),
             )
         except CloudrcError:  # a file is too large, or deleted since
             return None
+        uplink, downlink, _ = begin(ways, keys.start_s, 0)
         return uplink, downlink
 
     def after(self, records: Sequence[Record], now_ns: int) -> list[Record]:

@@ -26,6 +26,7 @@ from cloudrc.endpoint import Endpoint
 from cloudrc.errors import to_one_line
 from cloudrc.exposition.live import CLOCK_SET
 from cloudrc.files import TooLongError, Watched, read
+from cloudrc.link.profile import PERIOD_KEYS, RANDOM
 from cloudrc.link.state import RELEASED, RELEASED_SUFFIX, STATE_MAX, from_text
 from cloudrc.records import (
     Control,
@@ -284,6 +285,9 @@ class LinkNotes:
         if since_ns != state.since_ns:
             self._check.request(state.profile)
         asked = {key: nan if value is None else float(value) for key, value in state.asked.items()}
+        own = state.profile.get(state.direction, {})
+        if state.profile.get("start_s") == RANDOM and not own.keys().isdisjoint(PERIOD_KEYS):
+            own = {**own, "loop": True}
         changed = LinkChanged(
             stamp_ns=now_ns - slip_ns,
             uplink=self._uplink,
@@ -292,7 +296,7 @@ class LinkNotes:
             age=max(0, now_ns - state.since_ns) * 1e-9,
             time_line=(now_ns - state.origin_ns) * 1e-9,
             **{name: asked.get(name, nan) for name in ("delay", "jitter", "loss", "rate")},
-            conditions=json.dumps(state.profile.get(state.direction, {})),
+            conditions=json.dumps(own),
         )
         return [changed] if begins or since_ns != state.since_ns else []
 

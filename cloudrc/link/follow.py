@@ -20,12 +20,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from cloudrc.errors import CloudrcError
 from cloudrc.files import version
 from cloudrc.link.profile import DIRECTIONS, summary
+from cloudrc.link.profile_file import FILE_KEYS, with_files
+from cloudrc.link.start import begin, describe
 from cloudrc.link.state import CHANGE_FILE, ChangeFacts, LinkState, publish, read_change, to_text
 from cloudrc.outside.document import write_yaml
 
 if TYPE_CHECKING:
     from cloudrc.link.carry.udp import Address
-    from cloudrc.link.profile import DirectionProfile
+    from cloudrc.link.profile import DirectionProfile, ProfileKeys
 
 PROFILE_PERIOD = 0.05  # time between two checks whether the profile's file has changed [s]
 PEER_PAUSE = (0.5, 1.0)
@@ -42,6 +44,21 @@ class Loaded(NamedTuple):
     direction: DirectionProfile  # profile of the direction that this process shapes, in SI units
     values: dict[str, Any]  # content of the file, without defaults, to show to users
     change: ChangeFacts = ChangeFacts()  # the last change of the profile: its number and cause
+    start_ns: int = 0  # where the time line begins [ns]
+    note: str = ""  # says so in words; "" at its beginning
+
+
+def load_way(
+    keys: ProfileKeys, way: str, values: dict[str, Any], seed: int, stream: str = ""
+) -> Loaded:
+    """Read the files of a profile; return its direction `way`, and where its time line begins.
+
+    `values` are the content of the profile's file. The start depends on `seed` and `stream`.
+    """
+    both = with_files(keys.uplink), with_files(keys.downlink)
+    up, down, start_ns = begin(both, keys.start_s, seed, stream=stream)
+    note = describe(keys.start_s, start_ns, (up, down))
+    return Loaded(up if way == "uplink" else down, values, start_ns=start_ns, note=note)
 
 
 def publish_state(
@@ -97,7 +114,7 @@ def _with_names(values: dict[str, Any]) -> dict[str, Any]:
     """Replace the paths of files in a profile by the names of the files."""
     ways = {way: keys for way, keys in values.items() if isinstance(keys, dict)}
     names = {
-        way: {key: Path(keys[key]).name for key in ("trace", "table") if keys.get(key)}
+        way: {key: Path(keys[key]).name for key in FILE_KEYS if keys.get(key)}
         for way, keys in ways.items()
     }
     return values | {way: keys | names[way] for way, keys in ways.items()}

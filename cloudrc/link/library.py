@@ -6,7 +6,7 @@ direction, stream, episode and number of the packet alone, so two policies meet 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,14 @@ from cloudrc.link.draws import (
     uniforms_of,
 )
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.profile import Conditions, DirectionProfile
+from cloudrc.link.profile import (
+    DIRECTIONS,
+    RANDOM,
+    Conditions,
+    DirectionProfile,
+    Start,
+    going_round,
+)
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import Quantity
 
@@ -95,6 +102,25 @@ class LinkProfile:
 
     uplink: DirectionProfile
     downlink: DirectionProfile
+    start_s: Start | None = None  # where an episode begins in the time line [s], or random; None: 0
+
+    def __post_init__(self) -> None:
+        if self.start_s == RANDOM:  # then time lines go round
+            for way in DIRECTIONS:
+                object.__setattr__(self, way, going_round(getattr(self, way)))
+
+    @property
+    def period_ns(self) -> int:
+        """The longer period of both directions [ns]; 0 if none has one."""
+        return max(way.period_ns or 0 for way in (self.uplink, self.downlink))
+
+    def start_ns(self, seed: int, episode: int, stream: str = "") -> int:
+        """Return where in its time line an episode begins [ns], equal for both directions."""
+        if self.start_s is None:
+            return 0
+        from cloudrc.link.start import start_ns  # here: few links have a time line
+
+        return start_ns((self.uplink, self.downlink), self.start_s, seed, episode, stream)
 
 
 def read_profile(profile: str | Path | Mapping[str, Any] | LinkProfile) -> LinkProfile:
@@ -111,7 +137,7 @@ def read_profile(profile: str | Path | Mapping[str, Any] | LinkProfile) -> LinkP
     from cloudrc.link.profile_file import read_keys, with_files
 
     keys = read_keys(profile)
-    return LinkProfile(with_files(keys.uplink), with_files(keys.downlink))
+    return LinkProfile(with_files(keys.uplink), with_files(keys.downlink), keys.start_s)
 
 
 def open(
@@ -130,8 +156,9 @@ def open(
         BadInputError: If the profile cannot be used; the text says what to change.
     """
     both = read_profile(profile)
-    return OneWay(both.uplink, seed, True, stream=stream), OneWay(
-        both.downlink, seed, False, stream=stream
+    start = partial(both.start_ns, seed, stream=stream)
+    return OneWay(both.uplink, seed, True, stream=stream, start=start), OneWay(
+        both.downlink, seed, False, stream=stream, start=start
     )
 
 
@@ -147,16 +174,25 @@ class OneWay:
     """
 
     def __init__(
-        self, profile: DirectionProfile, seed: int, uplink: bool, *, stream: str = ""
+        self,
+        profile: DirectionProfile,
+        seed: int,
+        uplink: bool,
+        *,
+        stream: str = "",
+        start: Callable[[int], int] | None = None,
     ) -> None:
-        """Open a direction; `seed` and `stream` are those of `cloudrc.link.open`."""
+        """Open a direction; `seed` and `stream` are those of `cloudrc.link.open`.
+
+        `start` returns where in its time line an episode begins [ns]; without it, at 0.
+        """
         with naming("seed"):
             self._seed = SEED.of(seed)
         self.profile = profile
-        self._uplink, self._stream = uplink, stream
+        self._uplink, self._stream, self._start = uplink, stream, start
         self._episode = 0
         self._usual: int | None = None  # size of the first message of the episode [bytes]
-        self._link = self._new()
+        self._link = self._new(0)
 
     def send(self, episode: int, number: int, size: int, now_ns: int) -> Fate:
         """Send one packet, whatever its size; compute when it arrives.
@@ -276,7 +312,7 @@ class OneWay:
         from cloudrc.link.streams import sample
 
         sent_ns = range(first * period_ns, (first + count) * period_ns, period_ns)
-        return sample(self._new(), KIND, sent_ns, size, epoch=episode, first=first).delays
+        return sample(self._new(episode), KIND, sent_ns, size, epoch=episode, first=first).delays
 
     def expected(self, period: float = 0.01, size: int = 100) -> Numbers:
         """Compute what the profile asks for: statistics of 10,000 packets from the model.
@@ -294,10 +330,11 @@ class OneWay:
         return numbers(sample(link, KIND, range(0, _PACKETS * period_ns, period_ns), size))
 
     def _begin(self, episode: int) -> None:
-        self._episode, self._link, self._usual = episode, self._new(), None
+        self._episode, self._link, self._usual = episode, self._new(episode), None
 
-    def _new(self) -> LinkDirection:
-        return LinkDirection(self.profile, self._seed, self._uplink, stream=self._stream)
+    def _new(self, episode: int) -> LinkDirection:
+        origin_ns = -self._start(episode) if self._start else 0
+        return LinkDirection(self.profile, self._seed, self._uplink, origin_ns, stream=self._stream)
 
     def _independent(self, conditions: Conditions, episode: int, first: int, count: int) -> Floats:
         """Compute the delays [s] of packets with independent random numbers, shape (count,)."""

@@ -25,13 +25,18 @@ def enqueue(
     `departures`: when the packets before it leave [ns]; `size`: with its headers [bytes];
     `rate`: of the bottleneck [bit/s].
     """
-    while departures and departures[0] <= now_ns:
-        departures.popleft()
-    if len(departures) >= packets_max:
+    if not _has_room(departures, packets_max, now_ns):
         return None
     start = departures[-1] if departures else now_ns
     departures.append(start + round(size * 8e9 / rate))
     return departures[-1]
+
+
+def _has_room(departures: deque[int], packets_max: int, now_ns: int) -> bool:
+    """Forget the packets that have left by `now_ns` [ns]; return whether one more may wait."""
+    while departures and departures[0] <= now_ns:
+        departures.popleft()
+    return len(departures) < packets_max
 
 
 class LinkDirection:
@@ -65,25 +70,34 @@ class LinkDirection:
         """
         self._seed, self._uplink, self._stream = seed, uplink, stream
         self._origin_ns: int | None = origin_ns
+        self._start_ns = 0
         self._departures: deque[int] = deque()
         self._last_release_ns = 0
         self.blackouts = 0
         self.replace_profile(profile)
 
-    def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
+    def replace_profile(
+        self, profile: DirectionProfile, *, restart: bool = False, start_ns: int = 0
+    ) -> None:
         """Replace the profile from the next packet on.
 
         Seed and the bottleneck's queue are kept. The random impairments are the same as if
-        the link had used this profile from the start. With `restart`, the new time line starts at
-        the next packet; otherwise it starts at the same time as the old time line.
+        the link had used this profile from the start. With `restart`, the next packet is at
+        `start_ns` of the new time line; otherwise it starts at the same time as the old time line.
         """
         if restart:
-            self._origin_ns = None
+            self._origin_ns, self._start_ns = None, start_ns
         self.corrupts = profile.corrupt > 0.0
         self._profile = profile
         self._timeline = Timeline(profile)
         self._only = self._timeline.only()
-        self._plain = not profile.keep_order and all(p.rate is None for p in self._timeline.pieces)
+        times_ns, self._opportunities = profile.opportunities, None
+        if times_ns:
+            from cloudrc.link.opportunities import Opportunities  # here: few links need it
+
+            self._opportunities = Opportunities(times_ns)
+        has_rate = times_ns or any(p.rate is not None for p in self._timeline.pieces)
+        self._plain = not profile.keep_order and not has_rate
         self._fates: dict[tuple[int, int, int, float, Loss], list[Fate]] = {}
         self._place: tuple[int, int, int, Conditions] | None = None
 
@@ -98,7 +112,7 @@ class LinkDirection:
             duplicated packet. The second time is that of the copy, which may arrive first.
         """
         if self._origin_ns is None:
-            self._origin_ns = now_ns
+            self._origin_ns = now_ns - self._start_ns
         conditions = self._only or self._timeline.at(now_ns - self._origin_ns)
         if conditions.blackout:
             self.blackouts += 1
@@ -184,23 +198,29 @@ class LinkDirection:
         """
         arrival = now_ns
         if entry != OVERTAKES:
-            if conditions.rate is not None:
-                departure = enqueue(
-                    self._departures,
-                    size + HEADER_BYTES,
-                    conditions.rate,
-                    self._profile.queue_packets,
-                    now_ns,
-                )
-                if departure is None:
-                    return None
-                arrival = departure
+            departure = self._departure(conditions, size + HEADER_BYTES, now_ns)
+            if departure is None:
+                return None
+            arrival = departure
             delay_ns = conditions.delay_ns + entry
             if delay_ns > 0:
                 arrival += delay_ns
         if self._profile.keep_order:
             arrival = self._last_release_ns = max(arrival, self._last_release_ns)
         return arrival
+
+    def _departure(self, conditions: Conditions, size: int, now_ns: int) -> int | None:
+        """Return when a packet of `size` bytes leaves the bottleneck [ns]; None: it is full."""
+        departures, most = self._departures, self._profile.queue_packets
+        if conditions.rate is not None:
+            return enqueue(departures, size, conditions.rate, most, now_ns)
+        if self._opportunities is None:
+            return now_ns
+        if not _has_room(departures, most, now_ns):
+            return None
+        origin_ns = self._origin_ns or 0
+        departures.append(self._opportunities.leave_ns(size, now_ns - origin_ns) + origin_ns)
+        return departures[-1]
 
     def _find_table(self, epoch: int, kind: int, block: int, conditions: Conditions) -> list[Fate]:
         jitter, loss = conditions.jitter, conditions.loss

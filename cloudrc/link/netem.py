@@ -166,7 +166,8 @@ def check(profile: DirectionProfile) -> None:
     """Raise a RejectedError with the reason if netem cannot realise a profile."""
     pieces = Timeline(profile).pieces
     beyond = {
-        "a trace with loop": profile.rows is not None and profile.loop,
+        "a time line that goes round (loop, or start_s: random)": profile.loop,
+        "rate_trace": bool(profile.opportunities),
         "loss.delay_bad_ms (more delay while a burst of losses lasts)": any(
             isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad_ms for piece in pieces
         ),
@@ -313,8 +314,10 @@ class Netem:
             raise
         return peer
 
-    def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Use this profile from now on; with `restart`, its time line starts now.
+    def follow_profile(
+        self, profile: DirectionProfile, *, restart: bool = False, start_ns: int = 0
+    ) -> None:
+        """Use this profile from now on; with `restart`, its time line is at `start_ns` now.
 
         Without `restart`, the new time line keeps the start time of the old one. Datagrams
         in flight are not lost. If netem cannot realise the profile, the method raises a
@@ -325,7 +328,7 @@ class Netem:
         if self._damage:
             raise MissingPrerequisiteError(self._damage)
         before, room = (self._profile, self._origin_ns), self._room
-        self._take(profile, self._clock() if restart else self._origin_ns)
+        self._take(profile, self._clock() - start_ns if restart else self._origin_ns)
         if self._room < room:  # netem drops all packets while it holds more than its limit
             self._room += held
         try:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from math import inf
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple
 
 from cloudrc.outside.values import Quantity
 
@@ -27,6 +27,14 @@ CLOUD_TIME_MAX = 10
 """Largest value of cloud.horizon_max_s and of cloud.freeze_after_s [s]."""
 CloudTime = Annotated[float, Quantity(gt=0, le=CLOUD_TIME_MAX)]
 DIRECTIONS = ("uplink", "downlink")
+RANDOM: Final = "random"
+"""Start of a time line that is drawn from seed, episode and stream."""
+Start = NotNegative | Literal["random"]
+"""Where a time line begins: a time [s], or `RANDOM`."""
+
+
+PERIOD_KEYS = ("repeat_s", "trace", "rate_trace")
+"""Keys of a direction that give its time line a period."""
 
 
 @dataclass(frozen=True)
@@ -113,14 +121,18 @@ class DirectionKeys:
     null: no bottleneck"""
     queue_packets: Annotated[int, Quantity(ge=1, le=1_000_000, whole=True)] = 1000
     """Largest number of packets in the queue of the bottleneck; further packets are dropped"""
+    rate_trace: str | None = None
+    """File with the opportunities of a bottleneck, as mahimahi records them: a line per 1500 bytes
+    that may leave, its time in ms. It takes the place of rate_kbit; netem refuses it"""
     changes: tuple[Change, ...] = ()
     """Changes of the conditions over time; at_s must rise from entry to entry"""
     trace: str | None = None
     """CSV file with the columns time_s,delay_ms[,loss], which replace the keys delay_ms and loss. A
     relative path starts at the folder of the file that contains this key"""
     loop: bool = False
-    """Whether trace, changes and blackouts begin again after the end of the trace; netem refuses
-    true"""
+    """Whether trace, changes and blackouts begin again after a period; netem refuses true"""
+    repeat_s: Positive | None = None
+    """Period of the time line [s], with loop and with start_s: random; null: that of the trace"""
     blackouts: tuple[Blackout, ...] = ()
     """Intervals in which every packet is lost; they may overlap"""
 
@@ -131,7 +143,18 @@ class DirectionKeys:
         for before, after in pairwise(self.changes):
             if after.at_s <= before.at_s:
                 return f"at_s of changes must rise: {after.at_s:g} s is after {before.at_s:g} s"
-        return ""
+        if self.rate_trace and (self.rate_kbit or any(one.rate_kbit for one in self.changes)):
+            return "rate_kbit and rate_trace are both a rate; leave one of them out"
+        if self.loop and not self.may_repeat:
+            return f"loop: {NO_PERIOD}"
+        ends = [change.at_s for change in self.changes]
+        ends += [one.start_s + one.duration_s for one in self.blackouts]
+        return refuse_period(self.repeat_s, max(ends, default=0.0))
+
+    @property
+    def may_repeat(self) -> bool:
+        """Whether a key gives the time line a period."""
+        return any(getattr(self, key) for key in PERIOD_KEYS)
 
 
 @dataclass(frozen=True)
@@ -144,12 +167,37 @@ class ProfileKeys:
     """Conditions from world to cloud"""
     downlink: DirectionKeys = DirectionKeys()
     """Conditions from cloud to world"""
+    start_s: Start | None = None
+    """Where in the time line of both directions an episode or flight begins [s], or random: then
+    the line goes round. null: 0; of episodes random, if the line has a period"""
     command_age_max_ms: CommandAge | None = None
     """Default of guard.command_age_max_ms with this profile [ms]; null: 250"""
     horizon_max_s: CloudTime | None = None
     """Default of cloud.horizon_max_s with this profile [s]; null: 1"""
     freeze_after_s: CloudTime | None = None
     """Default of cloud.freeze_after_s with this profile [s]; null: 0.4"""
+
+    def conflict(self) -> str:
+        """Say which keys do not agree with each other; "" if all do."""
+        return refuse_start(self.start_s, self.uplink, self.downlink)
+
+
+NO_PERIOD = "the time line has no period; give repeat_s, its period in s"
+"""Why a time line cannot go round."""
+
+
+def refuse_start(start: Start | None, *ways: DirectionKeys) -> str:
+    """Say why a time line cannot begin at `start`; "" if it can."""
+    if start == RANDOM and not any(way.may_repeat for way in ways):
+        return f"start_s: random: {NO_PERIOD}"
+    return ""
+
+
+def refuse_period(period: float | None, last: float) -> str:
+    """Say why a time line whose last part is at `last` cannot have a period [s]; "" if it can."""
+    if period is None or period >= last:
+        return ""
+    return f"repeat_s: {period:g} s ends before the last entry, at {last:g} s; give a longer time"
 
 
 def mean_loss(loss: Loss) -> float:
@@ -180,8 +228,8 @@ class Trace:
     The delays replace the profile's `delay_ms`; the profile's jitter is added to them. If the trace
     has losses, they replace the profile's `loss`. The first row also applies before its time.
 
-    The last row applies forever. With the profile's `loop`, the last row lasts as long as the other
-    rows on average; then the trace begins again.
+    The last row applies forever. If the time line goes round and gives no other period, the last
+    row lasts as long as the other rows on average.
     """
 
     times: tuple[float, ...]  # since the link came up, strictly rising [s], shape (n,), n >= 1
@@ -209,6 +257,24 @@ class DirectionProfile(DirectionKeys):
     quantiles: tuple[float, ...] = ()
     """Delays in the file `table`, which are equally probable: mean 0, standard deviation 1, rising,
     shape (n,), in units of the jitter [1]"""
+    opportunities: tuple[int, ...] = ()
+    """Times in the file `rate_trace` at which packets may leave [ns], shape (n,); the last one is
+    its period"""
+
+    @property
+    def period_ns(self) -> int | None:
+        """Period of the time line [ns]; None if it has none."""
+        period = self.repeat_s
+        if period is None and self.rows is not None:
+            period = self.rows.period
+        if period is None:
+            return self.opportunities[-1] if self.opportunities else None
+        return round(period * 1e9)
+
+
+def going_round(profile: DirectionProfile) -> DirectionProfile:
+    """Return a direction whose time line begins again after its period, if it has one."""
+    return profile if profile.period_ns is None else replace(profile, loop=True)
 
 
 class Conditions(NamedTuple):
@@ -263,18 +329,19 @@ def settled(profile: DirectionProfile) -> DirectionProfile:
         changes=(),
         rows=None,
         blackouts=(),
+        loop=False,
+        repeat_s=None,
     )
 
 
-@lru_cache(maxsize=2)  # both directions of a link; of a trace with millions of rows it takes long
+@lru_cache(maxsize=8)  # of a few links; of a trace with millions of rows it takes long
 def _lay_out(profile: DirectionProfile) -> tuple[list[int], list[Conditions], int | None]:
     """Return what `Timeline` has: `pass_ns`, `pieces` and `period_ns`; nobody changes the lists."""
     instants = {0.0, *(change.at_s for change in profile.changes)}
     instants.update(profile.rows.times if profile.rows else ())
     for blackout in profile.blackouts:
         instants.update((blackout.start_s, blackout.start_s + blackout.duration_s))
-    period = profile.rows.period if profile.rows and profile.loop else None
-    period_ns = None if period is None else round(period * 1e9)
+    period_ns = profile.period_ns if profile.loop else None
     end_ns = inf if period_ns is None else period_ns
     ordered = [instant for instant in sorted(instants) if round(instant * 1e9) < end_ns]
     pass_ns = [round(instant * 1e9) for instant in ordered]

@@ -20,7 +20,7 @@ from cloudrc.outside.values import InvalidValueError
 from cloudrc.text import unknown_name_text
 
 FOLDER = Path(__file__).with_name("profiles")
-FILE_KEYS = ("trace", "table")
+FILE_KEYS = ("trace", "table", "rate_trace")
 """Keys of a direction whose values are paths of files."""
 _WORDS = {str: "text", bool: "true or false"}
 
@@ -47,7 +47,7 @@ def read_keys(profile: str | Path | Mapping[str, Any]) -> ProfileKeys:
 
 def with_files(direction: DirectionKeys) -> DirectionProfile:
     """Read the files that a direction names; raise a BadInputError if one cannot be used."""
-    if direction.trace is None and direction.table is None:
+    if not any(getattr(direction, key) for key in FILE_KEYS):
         return DirectionProfile(**vars(direction))
     from cloudrc.link.traces import link_profile
 

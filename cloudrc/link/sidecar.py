@@ -53,7 +53,7 @@ class Sidecar:
     route: Path  # file with the address to which the tunnel sends; the state is beside it
     tell: Callable[[LinkState], object]  # exports each new state of the link as metrics
     count: Callable[[dict[str, int]], object]  # exports datagrams by outcome, once a second
-    origin_ns: int = 0  # start of the time line [ns]; 0: when the peer becomes known
+    origin_ns: int = 0  # when the link comes up, then time 0 of its time line [ns]; 0: not yet
     peer: Address | None = None  # address of the other end
     state: LinkState | None = None  # last state that is published
     _reason: str = ""  # why this shaper was chosen, in words
@@ -75,7 +75,9 @@ class Sidecar:
             if stop():
                 return
             self.wait(STEP)
-        self.origin_ns = self.origin_ns or self.clock()
+        self.origin_ns = (self.origin_ns or self.clock()) - self.profile.start_ns
+        if self.profile.note:
+            self.log(self.profile.note)
         try:
             while not stop():
                 self._shape(self.peer, stop)
@@ -93,7 +95,7 @@ class Sidecar:
         """Run netem or the relay until `stop()` is true, or until a profile needs the other."""
         profile = self.profile
         if self.state and profile.change.restart:
-            self.origin_ns = self.clock()
+            self.origin_ns = self.clock() - profile.start_ns
         shaper, route = self._choose(profile, peer)
         self._shaper = shaper
         try:
@@ -134,9 +136,9 @@ class Sidecar:
 
     def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
         """Apply or refuse a new profile; return False if the relay has to replace netem for it."""
-        restart = profile.change.restart
+        restart, start_ns = profile.change.restart, profile.start_ns
         try:
-            shaper.follow_profile(profile.direction, restart=restart)
+            shaper.follow_profile(profile.direction, restart=restart, start_ns=start_ns)
         except CloudrcError as error:
             if self.mode == "auto":
                 self.log(f"the shaper changes to the relay: {_cause(error)}")
@@ -148,7 +150,7 @@ class Sidecar:
                 publish(to_text(self.state), self._state_file)
             return True
         if restart:
-            self.origin_ns = self.clock()
+            self.origin_ns = self.clock() - start_ns
         self.log(f"the new profile is in force ({profile.change.cause})")
         self.tell(self._publish(shaper, profile))
         return True

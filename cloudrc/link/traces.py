@@ -16,6 +16,7 @@ from typing import Any
 
 from cloudrc.errors import BadInputError
 from cloudrc.files import version
+from cloudrc.link.opportunities import read_opportunities
 from cloudrc.link.profile import (
     Blackout,
     Change,
@@ -23,6 +24,7 @@ from cloudrc.link.profile import (
     DirectionProfile,
     GilbertElliott,
     Trace,
+    refuse_period,
 )
 from cloudrc.outside.tables import SECONDS, SHARE, SIZE_MAX, CsvTable, read_lines
 from cloudrc.outside.values import Quantity
@@ -55,10 +57,15 @@ def link_profile(direction: DirectionKeys, file_max: int = SIZE_MAX) -> Directio
     Raise a BadInputError if a file cannot be used or is longer than `file_max` bytes.
     """
     table = direction.distribution == "table" and direction.table
+    rows = read_trace(Path(direction.trace), file_max) if direction.trace else None
+    if rows and (text := refuse_period(direction.repeat_s, rows.times[-1])):
+        raise BadInputError(f"trace {direction.trace}: {text}")
+    rates = direction.rate_trace
     return DirectionProfile(
         **{key.name: _plain(getattr(direction, key.name)) for key in fields(DirectionKeys)},
-        rows=read_trace(Path(direction.trace), file_max) if direction.trace else None,
+        rows=rows,
         quantiles=read_table(Path(table), file_max) if table else (),
+        opportunities=read_opportunities(Path(rates), file_max) if rates else (),
     )
 
 

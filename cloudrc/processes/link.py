@@ -31,12 +31,12 @@ from cloudrc.link.follow import (
     Loaded,
     PeerName,
     Profiles,
+    load_way,
 )
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.netem import Netem, find_netems
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Make, Sidecar
-from cloudrc.link.traces import link_profile
 from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, repeat, warn
 from cloudrc.tunnel.codec import peek
 
@@ -69,7 +69,8 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
     feed = Feed.on_stdout(watched=settings.feed)
     experiment = read_experiment(str(settings.config), robot_settings(settings.robot))
     exporter = open_exporter("link", experiment, settings.metrics)
-    load = make_profile_loader(settings.direction, settings.config.absolute())
+    file, seed = settings.config.absolute(), experiment.seed
+    load = make_profile_loader(settings.direction, file, seed)
     profiles = Profiles(settings.profile, load, log)
     profile, peer = profiles.first(), PeerName(settings.peer, ipv4_addresses, log)
     with (
@@ -114,16 +115,17 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
         sidecar.run(lambda: alive() if sidecar.state else stop())
 
 
-def make_profile_loader(direction: str, experiment: Path) -> Load:
+def make_profile_loader(direction: str, experiment: Path, seed: int) -> Load:
     """Return a function that reads one direction of the link from a profile's file.
 
-    The file may name the profile, or leave the link to the file `experiment`.
+    The file may name the profile, or leave the link to the file `experiment`. The `seed` decides
+    where a time line at random begins.
     """
 
     def load(path: Path) -> Loaded:
         profile = load_link(path.absolute(), experiment)
         values = profile.model_dump(mode="json", exclude_defaults=True)
-        return Loaded(link_profile(getattr(profile, direction)), values)
+        return load_way(profile, direction, values, seed)
 
     return load
 

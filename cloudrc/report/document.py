@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
+from cloudrc.config.time_line import link_start
 from cloudrc.metrics.flight import Flight
 from cloudrc.metrics.measure import Number
 from cloudrc.metrics.response import steps
@@ -90,6 +91,7 @@ class Assessment:
                 "code": self.code,
                 "mode": self.run.mode,
                 "seed": self.experiment.seed,
+                "link_start": link_start(self.experiment),
                 "shaper": self.run.shaper,
                 "records_sha256": self.records_sha256,
                 "numbers": values,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cloudrc import source
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
 from cloudrc.config.scene import scene_of
+from cloudrc.config.time_line import link_start
 from cloudrc.drivers.fleet import FleetRun
 from cloudrc.link.cell import Usage
 from cloudrc.link.waiting import md1, nddd1
@@ -130,6 +131,7 @@ def fleet_document(flown: FleetFlown) -> dict[str, Any]:
         "code": source.code_hash(),
         "mode": flown.mode,
         "seed": experiment.seed,
+        "link_start": link_start(experiment),
         "cell": cell_rows(flown.log, len(flown.robots), alone=alone),
         "cloud": flown.cloud,
         "separation_min_m": separation_min(flown.paths, scene_of(experiment.world).spawn),

@@ -11,6 +11,7 @@ import numpy as np
 
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
+from cloudrc.config.time_line import link_start
 from cloudrc.errors import CloudrcError, describe_error
 from cloudrc.files import read_json, write_atomically, write_json
 from cloudrc.geometry.obstacles import has_surface, obstacles
@@ -170,7 +171,8 @@ def _draw(
 
     flown = assessment.experiment
     shapes = flown_shapes(assessment.flight.recording, flown)
-    subject = Subject(assessment.flight, flown.uplink, flown.downlink, look or Look(), shapes)
+    ways, start = (flown.uplink, flown.downlink), link_start(flown) or 0.0
+    subject = Subject(assessment.flight, *ways, look or Look(), shapes, start)
     pictures = draw_all(subject, PRINT_KINDS if figures else PAGE_KINDS)
     if figures:
         if (target := folder / "figures").is_symlink():

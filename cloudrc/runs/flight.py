@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 
 from cloudrc import assembly, plugins
 from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.time_line import link_start
 from cloudrc.errors import describe_error, machine_error
 from cloudrc.metrics.measure import METRIC_NOTE, SHIPPED, find
 from cloudrc.outside import code
@@ -20,7 +21,8 @@ ERROR = "error"
 """Verdict of a flight that raised an exception, and code of its only failure."""
 Row: TypeAlias = dict[str, Any]
 """Result of a flight: `verdict`; `failures` (codes, `timed_out` first, then the earliest); `text`
-(the first failure, and why a metric has no value); `numbers` (metric -> value); `records_sha256`;
+(the first failure, and why a metric has no value); `numbers` (metric -> value); `link_start`, where
+the time line of the link begins [s]; `records_sha256`;
 `physics_steps`, the language of the physics steps and a hash of their machine code; and, if a
 plug-in failed, `traceback`. A row of a sweep also has `key`, `point`, `seed` and `code`, a hash of
 the sources."""
@@ -66,6 +68,7 @@ def row_of(found: Assessment, experiment: ResolvedExperiment) -> Row:
         "failures": [failure.code for failure in failures],
         "text": "; ".join([*(failure.text for failure in failures[:1]), *notes]),
         "numbers": {name: number.value for name, number in found.numbers.items()},
+        "link_start": link_start(experiment),
         "records_sha256": found.records_sha256,
         "physics_steps": assembly.step_code(experiment),
         **({"traceback": found.traceback} if found.traceback else {}),

@@ -95,7 +95,8 @@ def _experiment(
     `robot` is the number of a robot in a fleet.
     """
     tree: dict[str, Any] = parse_yaml(experiment.read_text("utf-8"), experiment.name)[0] or {}
-    link = load_link(profile, experiment).model_dump(mode="json", include=set(DIRECTIONS))
+    keys = {*DIRECTIONS, "start_s"}
+    link = load_link(profile, experiment).model_dump(mode="json", include=keys)
     tree["link"] = link
     tree.setdefault("name", order.get("name", "mission").replace("/", "-"))
     if "waypoints" in order:

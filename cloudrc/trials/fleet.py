@@ -106,6 +106,7 @@ class FleetFlight:
             "failures": self._failures,
             "text": self._text,
             "numbers": self._numbers(document),
+            "link_start": document["link_start"],
             "records_sha256": sha256(hashes.encode()).hexdigest(),
         }
 

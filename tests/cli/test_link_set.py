@@ -62,7 +62,7 @@ class Way:
     def __init__(self, folder, way, url):
         folder.mkdir(parents=True)
         (folder / "map.yaml").write_text("{uplink: {delay_ms: 45}, downlink: {delay_ms: 45}}")
-        load = make_profile_loader(way, folder / "none.yaml")
+        load = make_profile_loader(way, folder / "none.yaml", 1)
         self.folder, self.profiles = folder, Profiles(folder / "map.yaml", load, print)
         self.deaf, self.state = False, None
         self.apply(self.profiles.first())
@@ -75,7 +75,7 @@ class Way:
         return loaded.change.number
 
     def apply(self, loaded):
-        (_, values, change), asked = loaded, summary(loaded.direction)
+        values, change, asked = loaded.values, loaded.change, summary(loaded.direction)
         about = {"change": change.number, "cause": change.cause, "asked": asked}
         self.state = LinkState("relay", "", "relay", self.folder.name, values, "", 1, **about)
         write_atomically(self.folder / "link.json", to_text(self.state).encode())

@@ -12,7 +12,7 @@ from cloudrc.link.follow import PeerName, Profiles
 from cloudrc.link.state import ChangeFacts
 from cloudrc.processes.link import make_profile_loader
 
-LOAD = make_profile_loader("uplink", Path("none.yaml"))
+LOAD = make_profile_loader("uplink", Path("none.yaml"), 1)
 
 
 def change(delay_ms, number=""):

@@ -27,7 +27,7 @@ class Shaper:
         self._bench.did.append(f"{self.name} {peer[0]}")
         return peer if self.name == "netem" else ("127.0.0.1", 7401)
 
-    def follow_profile(self, profile, *, restart=False):
+    def follow_profile(self, profile, *, restart=False, start_ns=0):
         if self.name == "netem" and profile.delay_ms == 9e3:
             raise REFUSED
         self._bench.did.append(
@@ -115,6 +115,13 @@ def test_relay_touches_no_netem_and_leaves_no_route(tmp_path):
     assert bench.log == ["relay shapes the uplink (link.mode=relay)"]
     assert [path.name for path in tmp_path.iterdir()] == ["link.json"]
     assert np.diff(bench.counted_ns) == pytest.approx(1e9, abs=0.1e9)
+
+
+def test_a_time_line_begins_where_it_is_asked_to_and_the_log_says_so(tmp_path):
+    bench = Bench(tmp_path, "relay")
+    bench.sidecar.profile = Loaded(profile_of(), {}, start_ns=7, note="begins at 7 ns")
+    assert bench.run().origins_ns == [-7]
+    assert bench.log[0] == "begins at 7 ns"
 
 
 def test_auto_takes_netem_where_it_works(tmp_path):

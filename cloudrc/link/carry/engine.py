@@ -33,9 +33,11 @@ class LinkWay:
     first: int = 0  # number of the first packet since the profile has changed
     waited: int = 0  # packets of full batches: how long they waited to be read is not known
 
-    def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
+    def replace_profile(
+        self, profile: DirectionProfile, *, restart: bool = False, start_ns: int = 0
+    ) -> None:
         """Use another profile from the next packet on, as `LinkDirection.replace_profile`."""
-        self.link.replace_profile(profile, restart=restart)
+        self.link.replace_profile(profile, restart=restart, start_ns=start_ns)
         self.first = self.received
 
 

@@ -33,11 +33,12 @@ class MessageWay:
         self._stream: MessageStream | None = None
         self._delivered = self._given = 0  # messages of the stream
 
-    def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
+    def replace_profile(
+        self, profile: DirectionProfile, *, restart: bool = False, start_ns: int = 0
+    ) -> None:
         """Use another profile from the next packet on, as `LinkDirection.replace_profile`."""
-        self._way.replace_profile(profile, restart=restart)
-        if self._media:
-            self._media[0].replace_profile(profile, restart=restart)
+        for each in (self._way, *(self._media or ())[:1]):
+            each.replace_profile(profile, restart=restart, start_ns=start_ns)
 
     def take(self, data: bytes, now_ns: int) -> Packet | None:
         """Return the packet of a small message; carry any other one."""

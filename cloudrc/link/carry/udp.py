@@ -180,10 +180,12 @@ class Relay:
         host, port = self._inside.getsockname()
         return host, port
 
-    def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
+    def follow_profile(
+        self, profile: DirectionProfile, *, restart: bool = False, start_ns: int = 0
+    ) -> None:
         """Use this profile from now on; with `restart`, its time line starts at the next packet."""
         self._engine.take_in()  # datagrams that have arrived belong to the old profile
-        self._way.link.replace_profile(profile, restart=restart)
+        self._way.link.replace_profile(profile, restart=restart, start_ns=start_ns)
 
     def step(self, timeout: float) -> None:
         """Forward datagrams for `timeout` [s] or slightly longer."""

@@ -63,7 +63,8 @@ def parts(subject: Subject, *, uplink: bool) -> list[LinkSpan]:
     recording, seconds = subject.flight.recording, subject.flight.seconds
     sent, table = recording["/telemetry"]["stamp_ns"], recording["/link"]
     start = float(seconds(sent[0])) if len(sent) else 0.0
-    found = [LinkSpan(-inf, start, subject.uplink if uplink else subject.downlink, "")]
+    origin, at_start = start - subject.link_start, subject.uplink if uplink else subject.downlink
+    found = [LinkSpan(-inf, origin, at_start, "")]
     ours = select(table.columns, table["uplink"] == uplink)
     names = "stamp_ns", "age", "time_line", "conditions", "cause"
     for stamp_ns, age, time_line, conditions, cause in rows_of(ours, *names):

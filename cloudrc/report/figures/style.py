@@ -112,6 +112,7 @@ class Subject:
     downlink: DirectionConfig
     look: Look = Look()
     shapes: Shapes = NOTHING  # of robot and scene
+    link_start: float = 0.0  # where the time line of the link begins [s]
 
     @property
     def times(self) -> Array:

@@ -20,11 +20,10 @@ from cloudrc.drivers.local import LINK, LINK_FOLDER, announced, link_socket, soc
 from cloudrc.link.carry.engine import Engine, LinkWay
 from cloudrc.link.carry.messages import MessageWay
 from cloudrc.link.carry.tcp.medium import Medium
-from cloudrc.link.follow import Loaded, Profiles, make_folder, publish_state
+from cloudrc.link.follow import Loaded, Profiles, load_way, make_folder, publish_state
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.state import STATE_FILE, LinkState
-from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.packets import Period
 from cloudrc.outside.document import Document
 from cloudrc.outside.refusal import naming
@@ -72,12 +71,14 @@ class LiveLink:
         *,
         output: Path | None = None,
         flag: str = "-o",
+        stream: str = "",
         check: Check = lambda profile, name: None,
     ) -> None:
         """Read the profile of a command's link, and make the folder of its state.
 
         `output` is a new folder for the link's state, given by `flag`; without it, the state is in
-        a temporary folder. `tell` gets notes, and a sentence about each change.
+        a temporary folder. `tell` gets notes, and a sentence about each change. `stream` is the
+        name of the link, as in `cloudrc.link.open`.
 
         Raises:
             CloudrcError: If the profile or a setting cannot be used, or if `check` raises one.
@@ -91,6 +92,7 @@ class LiveLink:
         self.url = f"unix:{sockets}/api.sock"  # as of a run, though nothing listens there
         stack.enter_context(announced(folder, self.url, LINK))
         self.cause, self.seed, self.folder = edit.cause, asked.seed, folder / LINK_FOLDER
+        self._stream = stream
         self._reason, self._tell, self._check = f"cloudrc {command}", tell, check
         file = make_folder(self.folder, edit.values)
         self._files = {
@@ -110,20 +112,20 @@ class LiveLink:
         return self._loaded[way].direction
 
     def begin(self) -> int:
-        """Begin the time line; return its start, monotonic clock [ns]."""
-        now_ns = time.monotonic_ns()
-        self.origins_ns = dict.fromkeys(DIRECTIONS, now_ns)
-        return now_ns
+        """Begin the time line; return when its time was 0, monotonic clock [ns]."""
+        first = self._loaded["uplink"]  # both directions begin at one place
+        if first.note:
+            self._tell(first.note)
+        origin_ns = time.monotonic_ns() - first.start_ns
+        self.origins_ns = dict.fromkeys(DIRECTIONS, origin_ns)
+        return origin_ns
 
-    def carry(self, gives: Mapping[str, Callable[[Any], bool]], stream: str = "") -> None:
-        """Begin the time line of `ways`; `gives`: direction -> function that hands its packets on.
-
-        `stream` is the name of the link, as in `cloudrc.link.open`.
-        """
-        now_ns = self.begin()
+    def carry(self, gives: Mapping[str, Callable[[Any], bool]]) -> None:
+        """Begin the time line of `ways`; `gives` has a function per direction that hands on."""
+        origin_ns = self.begin()
         for way, give in gives.items():
-            up = way == "uplink"
-            link = LinkDirection(self.profile(way), self.seed, up, now_ns, stream=stream)
+            up, profile = way == "uplink", self.profile(way)
+            link = LinkDirection(profile, self.seed, up, origin_ns, stream=self._stream)
             self.ways[way] = LinkWay(link, give)
 
     def serve(self, engine: Engine, media: Mapping[str, Follower] | None = None) -> None:
@@ -155,10 +157,11 @@ class LiveLink:
     def _load(self, way: str, path: Path) -> Loaded:
         """Read one direction of a profile's file."""
         profile = load_profile(path)
-        direction = link_profile(getattr(profile, way))
+        values = profile.model_dump(mode="json", exclude_defaults=True)
+        loaded = load_way(profile, way, values, self.seed, self._stream)
         with naming(way):
-            self._check(direction, way)
-        return Loaded(direction, profile.model_dump(mode="json", exclude_defaults=True))
+            self._check(loaded.direction, way)
+        return loaded
 
     def _take(self, way: str, document: bytes) -> str:
         """Take a change from `cloudrc link set`; return its number."""
@@ -166,12 +169,13 @@ class LiveLink:
 
         def change() -> None:
             now_ns = time.monotonic_ns()
-            if loaded.change.restart:
-                self.origins_ns[way] = now_ns
+            restart, start_ns = loaded.change.restart, loaded.start_ns
+            if restart:
+                self.origins_ns[way] = now_ns - start_ns
             self._loaded[way] = loaded
             if way in self._followers:
-                restart = loaded.change.restart
-                self._followers[way].replace_profile(loaded.direction, restart=restart)
+                follower = self._followers[way]
+                follower.replace_profile(loaded.direction, restart=restart, start_ns=start_ns)
             self._publish(way, now_ns)
 
         assert self.engine is not None

@@ -52,9 +52,17 @@ def relay_topic(settings: TopicSettings, tell: Callable[[str], None]) -> Report:
     with contextlib.ExitStack() as stack:
         relay = TopicRelay(settings.source, settings.to)
         stack.callback(relay.close)
-        link = LiveLink(settings, "relay ros", tell, stack, output=settings.out, flag="--out")
+        link = LiveLink(
+            settings,
+            "relay ros",
+            tell,
+            stack,
+            output=settings.out,
+            flag="--out",
+            stream=settings.stream,
+        )
         relay.wait_for_publisher(tell)
-        link.carry({way: relay.publish}, settings.stream)
+        link.carry({way: relay.publish})
         there, back = (
             Medium(
                 link.profile(one),

@@ -1,12 +1,27 @@
 """A link whose profile changes while it runs says which direction has changed."""
 
 import contextlib
+import time
 from types import SimpleNamespace
 
 import pytest
 
 from cloudrc.runs.links.carrier import CarrySettings, LiveLink
 from cloudrc.runs.links.change import set_here
+
+
+@pytest.mark.parametrize(("start", "note"), [("12", "the time line begins at 12 s"), ("0", "")])
+def test_a_link_that_comes_up_tells_where_its_time_line_begins(start, note):
+    told = []
+    with contextlib.ExitStack() as stack:
+        asked = CarrySettings("handover", [f"start_s={start}"], 1)
+        live = LiveLink(asked, "a test", told.append, stack)
+        before_ns = time.monotonic_ns()
+        live.carry(dict.fromkeys(["uplink", "downlink"]))
+        origin_ns = live.origins_ns["downlink"]
+    assert told == [note] * bool(note)
+    assert origin_ns == live.origins_ns["uplink"]
+    assert 0 <= origin_ns + float(start) * 1e9 - before_ns < 10e9
 
 
 @pytest.mark.parametrize(

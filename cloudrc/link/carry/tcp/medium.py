@@ -37,18 +37,21 @@ class Medium:
         """
         self._origin_ns: int | None = origin_ns
         self._headers = headers
+        self._start_ns = 0
         self._departures = deque[int]()
         self._link = LinkDirection(profile, seed, uplink, origin_ns, stream=stream)
         self.replace_profile(profile)
 
-    def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Use another profile from now on; with `restart`, its time line begins now."""
+    def replace_profile(
+        self, profile: DirectionProfile, *, restart: bool = False, start_ns: int = 0
+    ) -> None:
+        """Use another profile from now on; with `restart`, its time line is at `start_ns` now."""
         if restart:
-            self._origin_ns = None
+            self._origin_ns, self._start_ns = None, start_ns
         self._queue_packets, self._timeline = profile.queue_packets, Timeline(profile)
         changes = tuple(replace(change, rate_kbit=None) for change in profile.changes)
         behind = replace(profile, rate_kbit=None, changes=changes)  # what follows the bottleneck
-        self._link.replace_profile(behind, restart=restart)
+        self._link.replace_profile(behind, restart=restart, start_ns=start_ns)
 
     def delay_ns(self, now_ns: int) -> int:
         """Return the delay of a packet without jitter [ns]."""
@@ -81,5 +84,5 @@ class Medium:
 
     def _at(self, now_ns: int) -> Conditions:
         if self._origin_ns is None:
-            self._origin_ns = now_ns
+            self._origin_ns = now_ns - self._start_ns
         return self._timeline.at(now_ns - self._origin_ns)

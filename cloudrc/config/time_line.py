@@ -1,0 +1,42 @@
+"""Find where in the time line of its link a flight begins."""
+
+from __future__ import annotations
+
+from cloudrc.config.profile import DIRECTIONS
+from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.errors import CloudrcError
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.start import begin
+from cloudrc.link.traces import link_profile
+
+
+def find_ways(
+    experiment: ResolvedExperiment,
+) -> tuple[DirectionProfile, DirectionProfile, int]:
+    """Return the conditions of uplink and downlink, and where their time lines begin [ns].
+
+    A fleet is at one place at one time, so the link of each of its robots begins there, too.
+    """
+    ways = link_profile(experiment.uplink), link_profile(experiment.downlink)
+    return begin(ways, experiment.link.start_s, experiment.seed)
+
+
+def link_start(experiment: ResolvedExperiment) -> float | None:
+    """Return where the time line of the link begins [s]; None if a file for it is lost."""
+    start = experiment.link.start_s
+    if not isinstance(start, str):
+        return start or 0.0
+    try:
+        return find_ways(experiment)[-1] / 1e9
+    except CloudrcError:
+        return None
+
+
+def describe_one_time_line(seeds: int, *experiments: ResolvedExperiment) -> str:
+    """Say that flights with several seeds meet one part of the time line; "" if they do not."""
+    for experiment in experiments:
+        link = experiment.link
+        repeats = any(getattr(link, way).may_repeat for way in DIRECTIONS)
+        if seeds > 1 and repeats and link.start_s is None:
+            return f"{seeds} seeds, one time line: --set link.start_s=random"
+    return ""
