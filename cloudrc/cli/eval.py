@@ -175,10 +175,13 @@ def _report(
     from cloudrc.eval.evidence import judge
     from cloudrc.eval.page import write_page
     from cloudrc.eval.provenance import provenance
+    from cloudrc.eval.time_line import describe_met, find_met
 
     found = judge(rows, before, *known) | known._asdict()
     for outcome in found["outcomes"][1:]:
         outcome |= setup.sent
+    found["time_line"] = met = find_met(setup, rows)
+    found["notes"] += describe_met(met) if met else []
     found["success"] = results.describe_success(setup, found["outcomes"])
     found |= provenance(setup, shlex.join(["cloudrc", *options.given]))
     document = results.write(folder, setup, found)

@@ -107,6 +107,7 @@ def play(episode: Episode, setup: EvalSetup, key: str = "") -> dict[str, Any]:
         "ended": ended,
         "numbers": {k: v for k, v in numbers.items() if v is not None and isfinite(v)},
         "age_counts": loop["age_counts"],
+        "link_start": loop["link_start"],
         "records_sha256": digest if setup.is_repeatable else "",
         "code": source.code_hash(),
     }

@@ -36,7 +36,7 @@ def provenance(setup: EvalSetup, command: str) -> dict[str, Any]:
         "command": command,
         "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
         "profile": {
-            name: asdict(replace(way, rows=None, quantiles=()))
+            name: asdict(replace(way, rows=None, quantiles=(), opportunities=()))
             for name, way in (("uplink", link.uplink), ("downlink", link.downlink))
         },
         "cite": CITE,

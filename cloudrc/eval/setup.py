@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from cloudrc.gym.loop import DATAGRAMS, Wire
+from cloudrc.gym.lane import DATAGRAMS, Wire
 from cloudrc.gym.step import StepTime
 from cloudrc.link.library import PACKET_BYTES, LinkProfile, read_profile
 from cloudrc.link.profile import DirectionProfile
@@ -156,8 +156,9 @@ class Episode:
 
 def _code_of_link(link: LinkProfile) -> str:
     """Return the hash of a profile with the contents of its files, wherever they are."""
-    ways = [replace(way, trace=None, table=None) for way in (link.uplink, link.downlink)]
-    return sha256(repr(ways).encode()).hexdigest()
+    both = link.uplink, link.downlink
+    ways = [replace(way, trace=None, table=None, rate_trace=None) for way in both]
+    return sha256(repr([*ways, link.start_s]).encode()).hexdigest()
 
 
 def link_at(profile: str, rtt_ms: float | None) -> LinkProfile:
@@ -176,4 +177,5 @@ def link_at(profile: str, rtt_ms: float | None) -> LinkProfile:
     def at(way: DirectionProfile, delay: float) -> DirectionProfile:
         return replace(way, delay_ms=delay, jitter_ms=min(way.jitter_ms, delay))
 
-    return LinkProfile(at(link.uplink, share * rtt_ms), at(link.downlink, (1 - share) * rtt_ms))
+    up, down = at(link.uplink, share * rtt_ms), at(link.downlink, (1 - share) * rtt_ms)
+    return replace(link, uplink=up, downlink=down)

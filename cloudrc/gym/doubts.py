@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from cloudrc.gym.loop import DATAGRAMS, Wire
+from cloudrc.gym.lane import DATAGRAMS, Wire
 from cloudrc.link.profile import Timeline, whole_share
 
 

@@ -21,38 +21,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
-from math import ceil, inf, isnan, nan
-from typing import Any, NamedTuple
+from functools import partial
+from math import ceil, inf, nan
+from typing import Any
 
 import numpy as np
 from gymnasium.error import ResetNeeded
 
+from cloudrc.gym.asked import Met, asked_of, expected
 from cloudrc.gym.executors import Chunk, Committed, Executor
+from cloudrc.gym.lane import Lane, Wire
+from cloudrc.gym.links import Choose, Chosen
 from cloudrc.gym.values import copied, size_of
-from cloudrc.link.carry.tcp.medium import Medium
-from cloudrc.link.carry.tcp.stream import MessageStream, run_due
 from cloudrc.link.draws import Floats, stream_key
-from cloudrc.link.library import Cut, LinkProfile, OneWay
-from cloudrc.link.model import HEADER_BYTES
-from cloudrc.link.profile import DirectionProfile, Timeline, summary, whole_share
-from cloudrc.link.queue import PacketQueue
+from cloudrc.link.library import LinkProfile
+from cloudrc.link.profile import DirectionProfile
 from cloudrc.metrics.age import most_missed
 from cloudrc.outside.values import Quantity
 
 EPISODES = 1 << 20
 """Number of episodes that belong to a seed of the environment."""
-DATAGRAMS, STREAM = "datagrams", "stream"
-DELIVERIES = (DATAGRAMS, STREAM)
-"""How messages arrive: whole if no packet is lost; or all, in order, and some of them late."""
 AGES = 100
 """Ages of actions that are counted apart [ticks]."""
-PACKETS = 50_000
-"""Packets of a simulation of what a profile asks for."""
-MESSAGES_MIN = 200
-"""Fewest messages of it."""
-SETTLED_NS = 100_000_000_000
-"""Time after which what is still repaired counts as lost there [ns]."""
+NO_LINK = LinkProfile(DirectionProfile(), DirectionProfile())
+"""Link before the first episode."""
 _COMPUTE = 129  # kind of the random numbers of the compute time
 
 
@@ -60,7 +52,6 @@ _COMPUTE = 129  # kind of the random numbers of the compute time
 class Settings:
     """How a robot and its policy are connected."""
 
-    link: LinkProfile
     seed: int  # of the link
     dt: float  # time of a tick [s]
     answer_within: float  # how long the robot waits in a tick for an answer [s]
@@ -74,169 +65,13 @@ class Settings:
     delivery: str  # one of DELIVERIES
     packet_bytes: int  # most bytes of a packet
 
-    @property
-    def wires(self) -> tuple[Wire, Wire]:
-        """The wire of observations and that of answers."""
+    def wires(self, link: LinkProfile) -> tuple[Wire, Wire]:
+        """Return the wire of observations and that of answers, over a link."""
         up, down = (
-            Wire(self.link, is_up, size, self.delivery, self.packet_bytes)
+            Wire(link, is_up, size, self.delivery, self.packet_bytes)
             for is_up, size in ((True, self.observation_bytes), (False, self.action_bytes))
         )
         return up, down
-
-
-class Wire(NamedTuple):
-    """What decides how the messages of one direction arrive, but for their random numbers."""
-
-    link: LinkProfile
-    uplink: bool  # whether they leave the robot
-    size: int  # of a message, usually [bytes]
-    delivery: str  # one of DELIVERIES
-    packet_bytes: int  # most bytes of a packet
-
-    @property
-    def profile(self) -> DirectionProfile:
-        """The direction's own profile."""
-        return self.link.uplink if self.uplink else self.link.downlink
-
-    @property
-    def back(self) -> DirectionProfile:
-        """The profile of the other direction."""
-        return self.link.downlink if self.uplink else self.link.uplink
-
-    @property
-    def cut(self) -> Cut:
-        """How messages are cut into packets."""
-        return Cut(self.packet_bytes).for_size(self.size)
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether a usual message is one packet that nobody repairs."""
-        return self.delivery == DATAGRAMS and self.size <= self.packet_bytes
-
-    @property
-    def bits(self) -> int:
-        """Size of a usual message with the headers of its packets [bit]."""
-        return 8 * (self.size + self.cut.usual * HEADER_BYTES)
-
-    @property
-    def occupies(self) -> float:
-        """Time for which a usual message occupies the bottleneck [s]; NaN without one."""
-        rate = summary(self.profile)["rate"]
-        return self.bits / rate if rate else nan
-
-
-@lru_cache(maxsize=64)
-def expected(wire: Wire, period: float) -> tuple[float, float]:
-    """Return the mean delay [s] and the loss of messages, one per `period` [s]."""
-    if wire.is_plain:
-        asked = OneWay(wire.profile, 0, uplink=True).expected(period, wire.size)
-        return asked.mean, asked.loss
-    count = max(MESSAGES_MIN, PACKETS // wire.cut.usual)
-    lane, period_ns = Lane(wire, 0, " expected"), round(period * 1e9)
-    for number in range(count):
-        lane.send(number, number * period_ns, None)
-    lane.run(count * period_ns + SETTLED_NS)
-    found = lane.summary(period, asked=(nan, nan))
-    is_simple = wire.delivery == DATAGRAMS and isnan(wire.occupies)
-    only = Timeline(wire.profile).only() if is_simple else None
-    share = 1.0 - lane.arrived / count
-    if only is not None and not only.blackout:
-        intact = (1.0 - wire.profile.corrupt) ** wire.cut.usual
-        share = 1.0 - intact * whole_share(only.loss, wire.cut.usual)
-    return found["delay_measured"], share
-
-
-class Lane:
-    """The messages of one direction, in flight and counted.
-
-    Attributes:
-        queue: The messages in flight; of a stream, those that have arrived.
-        is_stream: Whether losses are repaired. Then call `run` before you look into the queue.
-    """
-
-    def __init__(self, wire: Wire, seed: int, stream: str) -> None:
-        """Send over a link with its `seed` and its name, `stream`."""
-        self._wire, self._seed, self._name = wire, seed, stream
-        self._way = OneWay(wire.profile, seed, wire.uplink, stream=stream)
-        self._size, self._cut, self._occupies = wire.size, wire.cut, wire.occupies
-        self.is_stream = wire.delivery == STREAM
-        # Largest message that is a packet with its own number.
-        self._plain = wire.packet_bytes if wire.is_plain else -1
-        self.begin(0)
-
-    def begin(self, episode: int) -> None:
-        """Begin an episode without packets."""
-        self._episode, self.queue = episode, PacketQueue()
-        self.sent = self._delays_ns = self._delivered = 0
-        self._more_sent = self._more_lost = 0  # packets beyond one of each message
-        if self.is_stream:
-            self._agenda = PacketQueue()
-            ways = self._medium(self._wire.uplink), self._medium(not self._wire.uplink)
-            self._stream = MessageStream(self._agenda, ways, episode, self._cut, self._deliver)
-
-    def _medium(self, uplink: bool) -> Medium:
-        profile = self._wire.link.uplink if uplink else self._wire.link.downlink
-        name, headers = self._name, HEADER_BYTES
-        return Medium(profile, self._seed, uplink, 0, stream=name, headers=headers)
-
-    def send(self, number: int, now_ns: int, message: Any, more: int = 0) -> None:
-        """Send a message at `now_ns` [ns] with `more` bytes than usual, or lose it."""
-        self.sent += 1
-        size = self._size + more
-        if size <= self._plain:  # nearly all messages: save time
-            arrivals = self._way.send(self._episode, number, size, now_ns)
-            if len(arrivals) > 1:
-                arrivals = (min(arrivals),)  # of two copies
-        elif self.is_stream:
-            self._agenda.put(self._stream.send, (now_ns,), (number, size, (now_ns, message)))
-            return
-        else:
-            pieces = self._cut.pieces(number, size)
-            arrivals, lost = self._way.send_pieces(self._episode, pieces, now_ns)
-            self._more_sent += len(pieces) - 1
-            self._more_lost += lost - (not arrivals)
-        if arrivals:
-            self._delays_ns += arrivals[0] - now_ns
-        self.queue.put(None, arrivals, message)
-
-    def run(self, until_ns: int) -> None:
-        """Let a stream send, repair and deliver all that is due by `until_ns` [ns]."""
-        if self.is_stream:
-            run_due(self._agenda, until_ns)
-
-    def _deliver(self, sent: tuple[int, Any], now_ns: int) -> None:
-        """Take a message of the stream."""
-        sent_ns, message = sent
-        self._delays_ns += now_ns - sent_ns
-        self._delivered += 1
-        self.queue.put(None, (now_ns,), message)
-
-    @property
-    def arrived(self) -> int:
-        """Number of messages that arrive; of a stream, that have arrived."""
-        return self._delivered if self.is_stream else self.sent - self.queue.lost
-
-    def summary(self, period: float, asked: tuple[float, float] | None = None) -> dict[str, float]:
-        """Return delay [s] and loss of messages: asked by the profile, measured in this episode.
-
-        One message per `period` [s] is asked for, unless mean delay and loss are given as `asked`.
-        """
-        lost, arrived = self.queue.lost, self.arrived
-        delay, loss = asked or expected(self._wire, period)
-        packets = self.sent + self._more_sent, lost + self._more_lost
-        if self.is_stream:
-            packets = self._stream.transmissions, self._stream.lost
-        return {
-            "delay_asked": delay,
-            "delay_measured": self._delays_ns * 1e-9 / arrived if arrived else nan,
-            "loss_asked": loss,
-            "loss_measured": lost / self.sent if self.sent else nan,
-            "sent": self.sent,
-            "packets_sent": packets[0],
-            "packets_lost": packets[1],
-            "bytes": self._size,
-            "on_link": self._occupies,
-        }
 
 
 class RemoteLoop:
@@ -253,6 +88,7 @@ class RemoteLoop:
     def __init__(
         self,
         settings: Settings,
+        choose: Choose,
         executor: Executor,
         stream: str = "",
         *,
@@ -260,17 +96,26 @@ class RemoteLoop:
     ) -> None:
         """Connect; `stream` is the name of the robot. Call `begin` for each episode.
 
+        `choose` returns the link of an episode.
         `judge` raises an exception for a value of the executor that is no action.
         """
         self._settings, self._executor, self._judge = settings, executor, judge
         self.start = settings.start
         self._tick = -1  # before the first episode
-        self._wires = settings.wires
-        self._up, self._down = (Lane(wire, settings.seed, stream) for wire in self._wires)
+        self._choose, self._chosen = choose, Chosen("", NO_LINK)
         self._stream, self._episode = stream, -1
+        self._connect()
         self._within_ns = round(settings.answer_within * 1e9)
         self.compute: Callable[[int], float] = self._draw_time
         self.seen: list[Any] = [None, {}]
+
+    def _connect(self) -> None:
+        """Open both directions of the link that is chosen."""
+        link, seed, stream = self._chosen.profile, self._settings.seed, self._stream
+        start = partial(link.start_ns, seed, stream=stream)
+        self._up, self._down = (
+            Lane(wire, seed, stream, start) for wire in self._settings.wires(link)
+        )
 
     def begin(self, seed: int | None, observation: Any, info: Mapping[str, Any]) -> None:
         """Begin an episode: the policy has the first observation at once.
@@ -279,6 +124,10 @@ class RemoteLoop:
         that of the next episode.
         """
         self._episode = self._episode + 1 if seed is None else (int(seed) + 1) * EPISODES
+        chosen = self._choose(self._episode if seed is None else seed, self._episode, self._stream)
+        if chosen is not self._chosen:
+            self._chosen = chosen
+            self._connect()
         self._up.begin(self._episode)
         self._down.begin(self._episode)
         self._tick = self._now_ns = self._seen_tick = 0
@@ -297,7 +146,7 @@ class RemoteLoop:
     def _ticks_late(self) -> int:
         """Return the expected age of the loop [ticks]."""
         settings = self._settings
-        (up, _), (down, _) = (expected(wire, settings.dt) for wire in self._wires)
+        (up, _), (down, _) = (expected(lane.wire, settings.dt) for lane in (self._up, self._down))
         late = float(np.nan_to_num(up + down)) + settings.compute[0] - settings.answer_within
         return max(0, ceil(late / settings.dt - 1e-6))
 
@@ -421,8 +270,13 @@ class RemoteLoop:
             late = float(np.mean(actions > deadline + 1e-9))
         is_new = np.array(self._fresh_ages) * dt <= (inf if deadline is None else deadline) + 1e-9
         rounded = np.ceil(np.array(self._action_ages) - 1e-9).clip(max=AGES - 1)
+        link = self._chosen.profile
+        start_ns = link.start_ns(self._settings.seed, self._episode, self._stream)
+        met = Met(start_ns, round(ticks * dt * 1e9))
         return {
             "ticks": ticks,
+            "link": self._chosen.name,
+            "link_start": start_ns / 1e9,
             "loop_age": float(np.mean(self._loop_ages)) * dt if self._loop_ages else nan,
             **_describe("observation_age", np.array(self._observation_ages) * dt, dt),
             **_describe("action_age", actions, dt),
@@ -430,8 +284,8 @@ class RemoteLoop:
             "late_share": late,
             "misses_in_10": most_missed(~is_new) if len(is_new) else nan,
             "held_share": self._held / ticks if ticks else nan,
-            "uplink": self._up.summary(dt),
-            "downlink": self._down.summary(dt),
+            "uplink": self._up.summary(asked_of(self._up.wire, dt, met)),
+            "downlink": self._down.summary(asked_of(self._down.wire, dt, met)),
         }
 
 

@@ -8,11 +8,11 @@ from typing import Any, Unpack
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
+from cloudrc.gym.links import Links
 from cloudrc.gym.memory import Remembering
 from cloudrc.gym.options import (
     MEMORY,
     Options,
-    Profile,
     answer_space,
     connect,
     describe_answer,
@@ -48,7 +48,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def __init__(
         self,
         env: gymnasium.Env[Any, Any],
-        link: Profile = "ideal",
+        link: Links = "ideal",
         seed: int = 0,
         *,
         dt: float | None = None,
@@ -61,7 +61,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
         Args:
             env: The environment.
-            link: Name of a shipped link profile, path of a file, or mapping with its keys.
+            link: Link profile: its name, path or keys; a list of these, or a function (gym.md).
             seed: Seed of the network, whose episode `reset(seed=...)` selects.
             compute: Time that the policy needs for an answer [s], in which it takes no other
                 observation; or a pair, mean and standard deviation of a gamma distribution.

@@ -15,13 +15,14 @@ from gymnasium.vector.utils import batch_space, iterate
 from cloudrc import plugins
 from cloudrc.gym.doubts import LinkWarning, doubts
 from cloudrc.gym.executors import Executor
-from cloudrc.gym.loop import DATAGRAMS, DELIVERIES, RemoteLoop, Settings
+from cloudrc.gym.lane import DATAGRAMS, DELIVERIES
+from cloudrc.gym.links import Links, choose_link
+from cloudrc.gym.loop import RemoteLoop, Settings
 from cloudrc.gym.values import checker, copied, neutral, size_of
-from cloudrc.link.library import PACKET_BYTES, LinkProfile, read_profile
+from cloudrc.link.library import PACKET_BYTES
 from cloudrc.outside.refusal import check_names, naming
 from cloudrc.outside.values import InvalidValueError, Quantity
 
-Profile = str | Path | Mapping[str, Any] | LinkProfile
 SIZE = Quantity("bytes", 0, 1_000_000_000, whole=True)
 """Size of a message."""
 PACKET = replace(SIZE, ge=1)
@@ -100,7 +101,7 @@ def read_options(what: str, given: Options, more: Sequence[str] = ()) -> Options
 def connect(
     spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]],
     dt: float,
-    link: Profile,
+    link: Links,
     seed: int,
     streams: Iterable[str],
     options: Options,
@@ -119,7 +120,6 @@ def connect(
     else:
         checker(actions, f"as start= an action, or {ANSWER!r}")(start)
     settings = Settings(
-        link=read_profile(link),
         seed=seed,
         dt=dt,
         answer_within=_read_wait(options["answer_within"], dt),
@@ -133,11 +133,15 @@ def connect(
         delivery=options["delivery"],
         packet_bytes=options["packet_bytes"],
     )
+    choose, known = choose_link(link, seed)
     check, loops = checker(actions, "one action, or None"), list[RemoteLoop]()
     for stream in streams:
         own, is_ours = find_executor(options["executor"], chunked=chunk is not None)
-        loops.append(RemoteLoop(settings, own, stream, judge=None if is_ours else check))
-    for text in doubts(settings.wires, dt, asks_always=asks_always(own)):
+        judge = None if is_ours else check
+        loops.append(RemoteLoop(settings, choose, own, stream, judge=judge))
+    always = asks_always(own)
+    told = [text for each in known for text in doubts(settings.wires(each), dt, asks_always=always)]
+    for text in dict.fromkeys(told):
         warnings.warn(text, LinkWarning, stacklevel=4)
     return loops
 

@@ -9,9 +9,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
+from cloudrc.gym.links import Links
 from cloudrc.gym.options import (
     Options,
-    Profile,
     answer_space,
     connect,
     describe_answer,
@@ -40,7 +40,7 @@ class NetworkedVector(_Wrapper):
     def __init__(
         self,
         env: VectorEnv[Any, Any, Any],
-        link: Profile = "ideal",
+        link: Links = "ideal",
         seed: int = 0,
         *,
         dt: float | None = None,

@@ -9,8 +9,9 @@ import pytest
 
 import cloudrc.link
 from cloudrc.gym import Networked
+from cloudrc.gym.asked import expected
 from cloudrc.gym.doubts import LinkWarning
-from cloudrc.gym.loop import Lane, Wire, expected
+from cloudrc.gym.lane import Lane, Wire
 from cloudrc.link.carry.tcp.stream import MessageStream, Segment
 from cloudrc.link.library import Cut, read_profile
 from tests.gym.envs import Counter, both_ways, told
@@ -33,7 +34,7 @@ def delays(link, size, delivery, count, period_ms, seed=1):
     while lane.queue.next_ns < 1 << 63:
         arrival_ns, _, number = lane.queue.pop()
         found[number] = arrival_ns / MS - number * period_ms
-    return found, lane.summary(period_ms * 1e-3, asked=(0.0, 0.0))
+    return found, lane.summary((0.0, 0.0))
 
 
 def is_within(values, mean, errors=3.0):

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.bridges.ros2 import require_ros
 from cloudrc.config.profile import DIRECTIONS
@@ -63,17 +63,7 @@ def relay_topic(settings: TopicSettings, tell: Callable[[str], None]) -> Report:
         )
         relay.wait_for_publisher(tell)
         link.carry({way: relay.publish})
-        there, back = (
-            Medium(
-                link.profile(one),
-                settings.seed,
-                one == "uplink",
-                link.origins_ns[one],
-                stream=settings.stream,
-                headers=HEADER_BYTES,
-            )
-            for one in sorted(DIRECTIONS, key=lambda one: one != way)
-        )
+        there, back = _media(link, settings)
         engine, carried, quality = relay.open(
             link.ways[way], (there, back), reliable=settings.reliable
         )
@@ -96,6 +86,16 @@ def relay_topic(settings: TopicSettings, tell: Callable[[str], None]) -> Report:
         if settings.out:
             write_report(settings.out, report, link)
         return report
+
+
+def _media(link: LiveLink, settings: TopicSettings) -> list[Medium]:
+    """Return what repairs the losses of messages: the relayed direction, and the other one."""
+    both = sorted(DIRECTIONS, key=lambda way: way != settings.direction)
+    more: Any = {"stream": settings.stream, "headers": HEADER_BYTES}
+    return [
+        Medium(link.profile(way), settings.seed, way == "uplink", link.origins_ns[way], **more)
+        for way in both
+    ]
 
 
 def _run(engine: Engine, relay: TopicRelay, tell: Callable[[str], None]) -> None:
