@@ -137,7 +137,7 @@ def _warnings(setup: EvalSetup, episodes: list[Episode]) -> list[str]:
     from cloudrc.eval.results import SEEDLESS
 
     seedless = [] if setup.follows_seed else [f"--env {setup.env}: {SEEDLESS}"]
-    return [*seedless, *describe_doubts(setup, episodes)]
+    return [*seedless, *describe_doubts(setup)]
 
 
 def _versus(

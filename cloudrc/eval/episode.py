@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import cache
@@ -25,7 +25,6 @@ from cloudrc.eval.environment import environment_code, find_module
 from cloudrc.eval.setup import BARE, SEED, Episode, EvalSetup, link_at
 from cloudrc.gym import Networked
 from cloudrc.gym.doubts import LinkWarning, doubts
-from cloudrc.gym.options import asks_always, find_executor
 from cloudrc.gym.step import find_step
 from cloudrc.gym.values import leaves, size_of
 from cloudrc.outside.code import calling
@@ -276,7 +275,7 @@ def _play(
         "stale_share": stale / steps,
         "seam_jump": fmean(jumps) if jumps else None,
     }
-    return ended, success, witness.digest.hexdigest(), numbers, world.summary(setup.deadline)
+    return ended, success, witness.digest.hexdigest(), numbers, world.summary()
 
 
 def _connect(
@@ -293,6 +292,7 @@ def _connect(
             dt=setup.dt,
             compute=policy.duration if setup.is_measured else setup.compute_times,
             answer_within=setup.answer_within,
+            deadline=setup.deadline,
             chunk=count,
             executor=episode.chosen,
             observation_bytes=policy.size if sent is None else sent,
@@ -340,11 +340,9 @@ def _first_observation(setup: EvalSetup) -> tuple[str, int]:
         return witness.digest.hexdigest(), size_of(observe(observation, setup.mapped))
 
 
-def describe_doubts(setup: EvalSetup, episodes: Iterable[Episode]) -> list[str]:
+def describe_doubts(setup: EvalSetup) -> list[str]:
     """Say what makes observations over the link useless: few arrive, or their rate is too high."""
     assert setup.sent_bytes is not None
     assert setup.step is not None
-    chosen = {each.point["executor"]: each.chosen for each in episodes}.values()
-    always = any(asks_always(find_executor(each, chunked=True)[0]) for each in chosen)
     wires = [setup.wire(setup.sent_bytes, uplink=True)]
-    return list(doubts(wires, setup.step.seconds, asks_always=always))
+    return list(doubts(wires, setup.step.seconds, asks_always=True))

@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 
 from cloudrc.link.draws import Floats
 from cloudrc.outside.refusal import naming
@@ -75,6 +76,7 @@ class Linear(gymnasium.Env[Floats, Floats]):
         if self._first.shape not in ((), (states,)):
             raise InvalidValueError(f"x0 has the shape {self._first.shape}, not ({states},)")
         self.dt, self._limit = STEP.of(dt, "dt"), LIMIT.of(limit, "limit")
+        self._x: Floats | None = None  # before the first episode
         self.observation_space = spaces.Box(-np.inf, np.inf, (outputs,), np.float64)
         self.action_space = spaces.Box(-np.inf, np.inf, (inputs,), np.float64)
 
@@ -83,24 +85,26 @@ class Linear(gymnasium.Env[Floats, Floats]):
     ) -> tuple[Floats, dict[str, Any]]:
         """Begin an episode in the state `x0`."""
         super().reset(seed=seed)
-        self._x = self._first + np.zeros(len(self._a))
-        return self._seen()
+        return self._seen(self._first + np.zeros(len(self._a)))
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Move the plant by one step with the input `action`."""
         x, u = self._x, np.asarray(action, float)
+        if x is None:
+            raise ResetNeeded("call reset() before step()")
         cost = x @ self._q @ x + u @ self._r @ u
-        self._x = self._a @ x + self._b @ u + self._w @ self.np_random.standard_normal(len(x))
-        seen, info = self._seen()
-        is_over = bool(np.abs(self._x).max() > self._limit)
+        x = self._a @ x + self._b @ u + self._w @ self.np_random.standard_normal(len(x))
+        seen, info = self._seen(x)
+        is_over = bool(np.abs(x).max() > self._limit)
         return seen, -float(cost), is_over, False, info
 
-    def _seen(self) -> tuple[Floats, dict[str, Any]]:
-        """Return the outputs, and the state for the judge."""
-        seen = self._c @ self._x
+    def _seen(self, x: Floats) -> tuple[Floats, dict[str, Any]]:
+        """Move to the state `x`; return the outputs, and the state for the judge."""
+        self._x = x
+        seen = self._c @ x
         if self._v.any():
             seen = seen + self._v @ self.np_random.standard_normal(len(seen))
-        return seen, {"x": self._x.copy()}
+        return seen, {"x": x.copy()}
 
 
 def _matrix(name: str, value: Any, shape: tuple[int | None, int | None]) -> Floats:

@@ -19,19 +19,23 @@ one answer: of the questions that begin in one tick, the newest counts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from math import ceil, inf, nan
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 from gymnasium.error import ResetNeeded
 
 from cloudrc.gym.asked import Met, asked_of, expected
+from cloudrc.gym.doubts import doubts
 from cloudrc.gym.executors import Chunk, Committed, Executor
 from cloudrc.gym.lane import Lane, Wire
 from cloudrc.gym.links import Choose, Chosen
+from cloudrc.gym.memory import Remembering
 from cloudrc.gym.values import copied, size_of
 from cloudrc.link.draws import Floats, stream_key
 from cloudrc.link.library import LinkProfile
@@ -45,6 +49,9 @@ AGES = 100
 """Ages of actions that are counted apart [ticks]."""
 NO_LINK = LinkProfile(DirectionProfile(), DirectionProfile())
 """Link before the first episode."""
+_NEWEST: WeakValueDictionary[tuple[int, str], RemoteLoop] = WeakValueDictionary()
+# seed and stream -> the robot that has begun an episode last
+_TOLD = set[tuple[int, str]]()  # seeds and streams of which a warning told
 _COMPUTE = 129  # kind of the random numbers of the compute time
 
 
@@ -83,6 +90,7 @@ class RemoteLoop:
         compute: Function that returns how long the policy computes the answer to the observation
             of a tick [s]; at first, it is that of the settings.
         start: What the robot executes without any answer.
+        memory: What the policy remembers beside this observation.
     """
 
     def __init__(
@@ -90,6 +98,7 @@ class RemoteLoop:
         settings: Settings,
         choose: Choose,
         executor: Executor,
+        memory: Remembering,
         stream: str = "",
         *,
         judge: Callable[[Any], None] | None = None,
@@ -100,7 +109,7 @@ class RemoteLoop:
         `judge` raises an exception for a value of the executor that is no action.
         """
         self._settings, self._executor, self._judge = settings, executor, judge
-        self.start = settings.start
+        self.start, self.memory = settings.start, memory
         self._tick = -1  # before the first episode
         self._choose, self._chosen = choose, Chosen("", NO_LINK)
         self._stream, self._episode = stream, -1
@@ -108,6 +117,7 @@ class RemoteLoop:
         self._within_ns = round(settings.answer_within * 1e9)
         self.compute: Callable[[int], float] = self._draw_time
         self.seen: list[Any] = [None, {}]
+        self.is_asked = False
 
     def _connect(self) -> None:
         """Open both directions of the link that is chosen."""
@@ -131,6 +141,7 @@ class RemoteLoop:
         self._up.begin(self._episode)
         self._down.begin(self._episode)
         self._tick = self._now_ns = self._seen_tick = 0
+        _NEWEST[self._settings.seed, self._stream] = self
         self.seen, self._committed = [copied(observation), info], Committed()
         self.is_asked = True
         self._begin_ns = self._free_ns = 0  # when the policy began its last answer, and has it
@@ -141,21 +152,61 @@ class RemoteLoop:
         self._action_ages, self._loop_ages = list[float](), list[int]()
         self._fresh_ages = list[float]()  # of new actions since the first of _action_ages, else NaN
         self._executor.basis = -1
-        self._executor.begin(self._ticks_late(), round(self._settings.dt * 1e9))
+        self.memory.begin()
+        late = self._ticks_late((self._up.wire, self._down.wire))
+        self._executor.begin(late, round(self._settings.dt * 1e9))
 
-    def _ticks_late(self) -> int:
+    def _meet_twin(self) -> None:
+        """Say once if another robot is in the same episode of the same network, which draws."""
+        link, network = self._chosen.profile, (self._settings.seed, self._stream)
+        twin = _NEWEST.get(network, self)
+        if twin is self or twin._episode != self._episode or network in _TOLD:
+            return
+        ways = [replace(way, delay_ms=0.0) for way in (link.uplink, link.downlink)]
+        if twin._chosen.profile == link and ways != [DirectionProfile()] * 2:
+            _TOLD.add(network)
+            seed, stream = network
+            warnings.warn(
+                f"two robots with seed={seed} and stream={stream!r} meet one network: their ages "
+                "are equal; give each robot a stream= of its own",
+                stacklevel=4,
+            )
+
+    def _ticks_late(self, wires: tuple[Wire, Wire]) -> int:
         """Return the expected age of the loop [ticks]."""
         settings = self._settings
-        (up, _), (down, _) = (expected(lane.wire, settings.dt) for lane in (self._up, self._down))
+        (up, _), (down, _) = (expected(wire, settings.dt) for wire in wires)
         late = float(np.nan_to_num(up + down)) + settings.compute[0] - settings.answer_within
         return max(0, ceil(late / settings.dt - 1e-6))
+
+    def doubts(self, link: LinkProfile, count: int, longest: float) -> Iterator[str]:
+        """Say what makes episodes of at most `longest` [ticks] over a link pointless.
+
+        `count` is the number of actions in an answer.
+        """
+        settings, wires = self._settings, self._settings.wires(link)
+        dt, compute, late = settings.dt, settings.compute[0], self._ticks_late(wires)
+        asks_always = type(self._executor).asks is Executor.asks
+        yield from doubts(wires, dt, asks_always=asks_always)
+        if late < longest:
+            if text := self._executor.doubt(count, late):
+                yield text
+            return
+        takes = compute if compute >= longest * dt else late * dt
+        yield (
+            f"no step gets an answer: an answer takes {takes:.3g} s, an episode "
+            f"{longest * dt:.3g} s; times are in s"
+        )
 
     def act(self, actions: tuple[Any, ...]) -> Any:
         """Take the policy's answer, if it is asked; return the action that the robot executes."""
         tick, executor = self._tick, self._executor
         if tick < 0:
             raise ResetNeeded("call reset() before step()")
+        if not tick:
+            self._meet_twin()
         if self.is_asked:
+            self.memory.add(actions[0])
             self._answer(actions)
         self._receive(self._now_ns + self._within_ns)
         action = executor.action(tick)
@@ -237,6 +288,11 @@ class RemoteLoop:
         shape = (mean / deviation) ** 2
         return np.random.Generator(bits).gamma(shape, mean / shape)
 
+    def observed(self) -> Any:
+        """Return a copy of the newest observation that the policy has taken, with its memory."""
+        age = (self._tick - self._seen_tick) * self._settings.dt
+        return self.memory.beside(copied(self.seen[0]), age=age, step=self._seen_tick)
+
     def told(self) -> dict[str, Any]:
         """Return what the policy may know about the loop, as `info["cloudrc"]`."""
         dt = self._settings.dt
@@ -252,18 +308,16 @@ class RemoteLoop:
             found["prefix"], found["delay"] = self._committed
         return found
 
-    def summary(self, deadline: float | None = None) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """Return what the loop was like in this episode: asked and measured.
 
-        `late_share` is the share of steps whose action is older than `deadline` [s], by default
-        that of the settings. `age_counts` has the steps by the action's age in ticks, rounded up;
-        the last possible, all older ones.
+        `late_share` is the share of steps whose action is older than the deadline. `age_counts` has
+        the steps by the action's age in ticks, rounded up; the last possible, all older ones.
         """
         ticks, dt = self._tick, self._settings.dt
         if ticks < 0:
             raise ResetNeeded("call reset() before summary()")
-        if deadline is None:
-            deadline = self._settings.deadline
+        deadline = self._settings.deadline
         actions = np.array(self._action_ages) * dt
         late = nan
         if deadline is not None and len(actions):

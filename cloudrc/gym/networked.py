@@ -9,17 +9,17 @@ import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
 from cloudrc.gym.links import Links
-from cloudrc.gym.memory import Remembering
 from cloudrc.gym.options import (
-    MEMORY,
     Options,
     answer_space,
+    check_kind,
     connect,
     describe_answer,
     read_options,
+    warn_of,
 )
 from cloudrc.gym.step import find_step
-from cloudrc.gym.values import checker, copied
+from cloudrc.gym.values import checker
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import to_arrays
 
@@ -40,6 +40,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     has a summary, `episode`, with delays and losses: asked by the profile, and measured.
 
     Attributes:
+        step_time: The time of a step, and who tells it; `dt` is this time alone [s].
         world_info: The environment's own info of the last step, without any delay: for whoever
             judges the episode, not for the policy.
     """
@@ -53,8 +54,6 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         *,
         dt: float | None = None,
         stream: str = "",
-        observe_age: bool = False,
-        observe_actions: int = 0,
         **options: Unpack[Options],
     ) -> None:
         """Wrap an environment.
@@ -67,8 +66,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 observation; or a pair, mean and standard deviation of a gamma distribution.
             answer_within: Time for which the robot waits in a step for an answer [s]; None: 5 %.
             deadline: Age of an action [s] above which the summary counts a step as late.
-            chunk: Number of actions in an answer, for the ticks from the observation's on; None:
-                an answer is a single action.
+            chunk: Number of actions in an answer, from the observation's tick on; None: only one.
             executor: How the robot executes answers: the name of a plug-in, or the path of a file.
             hold: Without an action it executes the last one, "repeat", or `start`, "start".
             start: Action before the first answer arrives; None: 0, or what is nearest to it;
@@ -78,31 +76,27 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             packet_bytes: Most bytes of a packet; a larger message is several packets.
             dt: Time of a step [s]; None: that of the environment.
             stream: Name of the robot; robots with one seed and two names share no random numbers.
-            observe_age: Whether the policy also observes the age of its observation.
-            observe_actions: How many of its own last actions the policy also observes; of chunks,
-                the first. With either, observations are mappings, as those of `Remembering`.
+            observe_age: Whether the policy also observes the age of its observation [s].
+            observe_actions: How many of its last actions it also observes; of chunks, the first.
+            observe_step: Whether it also observes in which step its observation was taken. With any
+                of the three, observations are mappings, as those of `Remembering`.
 
         Raises:
             cloudrc.errors.CloudrcError: If a value cannot be used; the text says what to change.
         """
-        options = read_options("Networked", options, MEMORY)
-        memory = {"observe_age": observe_age, "observe_actions": observe_actions}
-        given: dict[str, Any] = {"dt": dt, "stream": stream, **memory, **options}
-        RecordConstructorArgs.__init__(self, link=link, seed=seed, **given)
+        options = read_options("Networked", options)
+        RecordConstructorArgs.__init__(self, link=link, seed=seed, dt=dt, stream=stream, **options)
+        check_kind(env, gymnasium.Env, "environment")
         gymnasium.Wrapper.__init__(self, env)
-        self.dt, _ = find_step(env, dt)
+        self.step_time = find_step(env, dt)
+        self.dt = self.step_time.seconds
         both = env.observation_space, env.action_space
-        (self._loop,) = connect(both, self.dt, link, seed, (stream,), options)
-        self._set_spaces(options, observe_age, observe_actions)
+        (self._loop,), links = connect(both, self.dt, link, seed, (stream,), options)
+        self.action_space, self._split = answer_space(env.action_space, options["chunk"])
+        self._check = checker(self.action_space, describe_answer(options["chunk"]))
+        self.observation_space = self._loop.memory.space
         self.world_info: dict[str, Any] = {}
-
-    def _set_spaces(self, options: Options, age: bool, count: int) -> None:
-        """Set the spaces of answers, and of observations with memory if it is asked for."""
-        both, chunk = (self.env.observation_space, self.env.action_space), options["chunk"]
-        self.action_space, self._split = answer_space(both[1], chunk)
-        self._check = checker(self.action_space, describe_answer(chunk))
-        self._memory = Remembering(both, age, count, self._loop.start)
-        self.observation_space = self._memory.space
+        warn_of(env, self._loop, links, self.step_time, options["chunk"])
 
     @property
     def compute(self) -> Callable[[int], float]:
@@ -116,13 +110,12 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def compute(self, time: Callable[[int], float]) -> None:
         self._loop.compute = time
 
-    def summary(self, deadline: float | None = None) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """Return what `info["cloudrc"]["episode"]` has, also before the end of an episode.
 
-        A `deadline` [s] takes the place of the argument of this name. Raise gymnasium's ResetNeeded
-        before the first `reset`.
+        Raise gymnasium's ResetNeeded before the first `reset`.
         """
-        return self._loop.summary(deadline)
+        return self._loop.summary()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -130,17 +123,14 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Begin an episode; the policy has the first observation at once."""
         observation, self.world_info = self.env.reset(seed=seed, options=options)
         self._loop.begin(seed, observation, self.world_info)
-        self._memory.begin()
         return self._seen()
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Send the policy's answer, and step the world with what the robot executes."""
         action = to_arrays(action)
         self._check(action)
-        loop, answer = self._loop, self._split(action)
-        if loop.is_asked:
-            self._memory.add(answer[0])
-        executed = loop.act(answer)
+        loop = self._loop
+        executed = loop.act(self._split(action))
         observation, reward, terminated, truncated, self.world_info = self.env.step(executed)
         loop.observe(observation, self.world_info)
         seen, info = self._seen()
@@ -149,7 +139,5 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return seen, reward, terminated, truncated, info
 
     def _seen(self) -> tuple[Any, dict[str, Any]]:
-        observation, info = self._loop.seen
-        observation, told = copied(observation), self._loop.told()
-        seen = self._memory.beside(observation, told["observation_age"])
-        return seen, {**info, "cloudrc": told}
+        loop = self._loop
+        return loop.observed(), {**loop.seen[1], "cloudrc": loop.told()}

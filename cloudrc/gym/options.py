@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Any, TypedDict, cast
 
 import gymnasium
+from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space, iterate
 
 from cloudrc import plugins
-from cloudrc.gym.doubts import LinkWarning, doubts
+from cloudrc.gym.doubts import LinkWarning
 from cloudrc.gym.executors import Executor
 from cloudrc.gym.lane import DATAGRAMS, DELIVERIES
 from cloudrc.gym.links import Links, choose_link
 from cloudrc.gym.loop import RemoteLoop, Settings
+from cloudrc.gym.memory import Remembering
+from cloudrc.gym.step import FILM, WAY, StepTime, layers
 from cloudrc.gym.values import checker, copied, neutral, size_of
-from cloudrc.link.library import PACKET_BYTES
+from cloudrc.link.library import PACKET_BYTES, LinkProfile
 from cloudrc.outside.refusal import check_names, naming
 from cloudrc.outside.values import InvalidValueError, Quantity
 
@@ -58,6 +62,9 @@ class Options(TypedDict, total=False):
     action_bytes: int | None
     delivery: str
     packet_bytes: int
+    observe_age: bool
+    observe_actions: int
+    observe_step: bool
 
 
 DEFAULTS: Options = {
@@ -72,19 +79,17 @@ DEFAULTS: Options = {
     "action_bytes": None,
     "delivery": DATAGRAMS,
     "packet_bytes": PACKET_BYTES,
+    "observe_age": False,
+    "observe_actions": 0,
+    "observe_step": False,
 }
 ARGUMENTS = ("env", "link", "seed", "dt", "stream", *DEFAULTS)
 """Names of the arguments of `Networked` and `NetworkedVector`."""
-MEMORY = ("observe_age", "observe_actions")
-"""Names of those that only `Networked` has."""
 
 
-def read_options(what: str, given: Options, more: Sequence[str] = ()) -> Options:
-    """Read the options of the environment `what`; those that are not given have their defaults.
-
-    `more` are names of further arguments of it.
-    """
-    check_names(f"argument of {what}", given, (*ARGUMENTS, *more))
+def read_options(what: str, given: Options) -> Options:
+    """Read the options of the environment `what`; those that are not given have their defaults."""
+    check_names(f"argument of {what}", given, ARGUMENTS)
     read: dict[str, Any] = {**DEFAULTS, **given}
     check_names("hold", [read["hold"]], ("repeat", "start"))
     check_names("delivery", [read["delivery"]], DELIVERIES)
@@ -105,8 +110,8 @@ def connect(
     seed: int,
     streams: Iterable[str],
     options: Options,
-) -> list[RemoteLoop]:
-    """Connect a robot of each of the `streams` with its policy.
+) -> tuple[list[RemoteLoop], list[LinkProfile]]:
+    """Connect a robot of each of the `streams` with its policy; also return the known links.
 
     `spaces` are those of an observation and of an action; `dt` is the time of a step [s]. All
     `options` are there, as `read_options` returns them.
@@ -136,19 +141,44 @@ def connect(
     choose, known = choose_link(link, seed)
     check, loops = checker(actions, "one action, or None"), list[RemoteLoop]()
     for stream in streams:
-        own, is_ours = find_executor(options["executor"], chunked=chunk is not None)
-        judge = None if is_ours else check
-        loops.append(RemoteLoop(settings, choose, own, stream, judge=judge))
-    always = asks_always(own)
-    told = [text for each in known for text in doubts(settings.wires(each), dt, asks_always=always)]
-    for text in dict.fromkeys(told):
+        own, is_ours = find_executor(options["executor"], actions, chunked=chunk is not None)
+        memory, judge = Remembering(spaces, options, settings.start), None if is_ours else check
+        loops.append(RemoteLoop(settings, choose, own, memory, stream, judge=judge))
+    return loops, known
+
+
+def check_kind(env: Any, kind: type, name: str) -> None:
+    """Refuse what is no environment of the `kind`, a class of gymnasium with this `name`."""
+    if isinstance(env, kind):
+        return
+    who = f"{type(env).__name__} is no {name} of gymnasium"
+    if isinstance(env, gymnasium.Env | VectorEnv):
+        other = "NetworkedVector" if isinstance(env, VectorEnv) else "Networked"
+        raise InvalidValueError(f"{who}; give it to {other}")
+    makers = {each.__module__.partition(".")[0] for each in type(env).__mro__}
+    if "pettingzoo" in makers:
+        who += " but one of PettingZoo, in which several agents act"
+    raise InvalidValueError(f"{who}; wrap what one robot sees and does in a gymnasium.Env")
+
+
+def warn_of(
+    env: Any,
+    loop: RemoteLoop,
+    links: Iterable[LinkProfile],
+    step: StepTime,
+    count: int | None,
+) -> None:
+    """Warn whoever wraps an environment, if its episodes make no sense or its step is a guess.
+
+    `links` are those that are known; `count` is the number of actions in an answer, None for one.
+    """
+    limits = [each.spec.max_episode_steps for each in layers(env) if each.spec]
+    longest = min(filter(None, limits), default=inf)
+    texts = [text for link in links for text in loop.doubts(link, count or 1, longest)]
+    if FILM in step.source:
+        texts.append(f"a step takes {step}; if it takes another time, {WAY}")
+    for text in dict.fromkeys(texts):
         warnings.warn(text, LinkWarning, stacklevel=4)
-    return loops
-
-
-def asks_always(executor: Executor) -> bool:
-    """Return whether a robot with this executor sends the observation of each step."""
-    return type(executor).asks is Executor.asks
 
 
 def _read_wait(given: float | None, dt: float) -> float:
@@ -193,8 +223,12 @@ def full_name(executor: str | Path) -> str:
     return name if plugins.is_path(name) else name.replace("-", "_")
 
 
-def find_executor(given: str | Path | Mapping[str, Any], *, chunked: bool) -> tuple[Executor, bool]:
+def find_executor(
+    given: str | Path | Mapping[str, Any], actions: gymnasium.Space[Any], *, chunked: bool
+) -> tuple[Executor, bool]:
     """Build an executor by name or path, or by a mapping with its `name` and its parameters.
+
+    It executes `actions`, of which an answer is a chunk or a single one.
 
     Also return whether cloudrc ships it, so that its actions need no judge.
     """
@@ -210,4 +244,9 @@ def find_executor(given: str | Path | Mapping[str, Any], *, chunked: bool) -> tu
         if executor.needs_chunk and not chunked:
             text = "it plays chunks of actions; give chunk=, the number of actions in an answer"
             raise InvalidValueError(text)
+        if executor.needs_floats and getattr(actions.dtype, "kind", "") != "f":
+            raise InvalidValueError(
+                f"it computes means of actions, which must be floating-point numbers, and these "
+                f"are in {actions}; choose 'time_indexed', or 'async' with aggregate=latest"
+            )
     return executor, plugins.find("executors", found).is_shipped

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 
 from cloudrc.gym.networked import Networked
-from cloudrc.gym.options import ARGUMENTS, MEMORY
+from cloudrc.gym.options import ARGUMENTS
 from cloudrc.gym.vector import NetworkedVector
 from cloudrc.outside.refusal import check_names
 
@@ -48,7 +48,7 @@ def make(
 
     `env_args` are arguments of the environment, all others those of `Networked`.
     """
-    known = *ARGUMENTS, *MEMORY, "env_args", "render_mode"
+    known = *ARGUMENTS, "env_args", "render_mode"
     check_names(f"argument of {NAME}", networked, known)
     inner = gymnasium.make(env, render_mode=render_mode, **(env_args or {}))
     return Networked(inner, **networked)

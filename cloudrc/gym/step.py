@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dis
 from collections.abc import Iterator, Mapping
 from math import isnan, nan, remainder
 from typing import Any, NamedTuple
@@ -18,6 +19,8 @@ TIMES = ("step_dt", "dt", "tau")
 """Names of times [s]; all others are rates [1/s]."""
 FRAME_ROUNDING = 0.12
 """How far the number of steps in a frame may be from a whole one: rates of frames are rounded."""
+FILM = ", a film's rate"
+"""End of the words for a time that is that of a frame."""
 WAY = "give dt=, the time of a step in seconds"
 
 
@@ -60,7 +63,7 @@ def find_step(env: Any, given: float | None) -> StepTime:
         raise InvalidValueError(
             f"{who}: {name} says {time:.4g} s, render_fps says {frame:.4g} s; {WAY}"
         )
-    return StepTime(time, f"{name} of {who}" + ", a film's rate" * (name == "render_fps"))
+    return StepTime(time, f"{name} of {who}" + FILM * (name == "render_fps"))
 
 
 def layers(env: Any) -> Iterator[Any]:
@@ -99,6 +102,21 @@ def _seconds(name: str, value: Any) -> float:
 
 
 def _repeats(wrapper: Any) -> bool:
-    """Return whether a wrapper says that it makes several steps of one: in frames that it skips."""
+    """Return whether a wrapper makes several steps of one: it skips frames, or has a loop."""
     named = [each for name, each in vars(wrapper).items() if "skip" in name or "repeat" in name]
-    return any(type(each) is int and each > 1 for each in named)
+    return any(type(each) is int and each > 1 for each in named) or _loops(wrapper)
+
+
+def _loops(wrapper: Any) -> bool:
+    """Return whether the `step` of a user's wrapper calls another `step` in a loop.
+
+    Wrappers of gymnasium name the frames that they skip. The code is looked at in place of the
+    text, which Python does not have of classes that were typed or piped into it.
+    """
+    step = type(wrapper).step
+    if step.__module__.startswith("gymnasium.") or not hasattr(step, "__code__"):
+        return False
+    code = [*dis.get_instructions(step)]
+    calls = [each.offset for each in code if each.argval == "step"]
+    backward = [each for each in code if "JUMP_BACKWARD" in each.opname]
+    return any(jump.argval <= at < jump.offset for jump in backward for at in calls)

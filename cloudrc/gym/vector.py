@@ -13,12 +13,14 @@ from cloudrc.gym.links import Links
 from cloudrc.gym.options import (
     Options,
     answer_space,
+    check_kind,
     connect,
     describe_answer,
     read_options,
+    warn_of,
 )
 from cloudrc.gym.step import find_step
-from cloudrc.gym.values import checker, copied
+from cloudrc.gym.values import checker
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import to_arrays
 
@@ -52,18 +54,24 @@ class NetworkedVector(_Wrapper):
         `dt` is the time of a step [s].
         """
         options = read_options("NetworkedVector", options)
+        check_kind(env, VectorEnv, "vector environment")
         super().__init__(env)
         space, chunk = env.single_action_space, options["chunk"]
         names = [f"{stream}/{robot}" for robot in range(env.num_envs)]
         both = env.single_observation_space, space
-        time, _ = find_step(env, dt)
-        self._loops = connect(both, time, link, seed, names, options)
+        self.step_time = find_step(env, dt)
+        self._loops, links = connect(both, self.step_time.seconds, link, seed, names, options)
         self.single_action_space, self._split = answer_space(space, chunk)
         self.action_space = batch_space(self.single_action_space, env.num_envs)
         words = f"for each of {env.num_envs} robots {describe_answer(chunk)}"
         self._check = checker(self.action_space, words)
+        seen = self._loops[0].memory.space
+        if seen is not both[0]:  # it has memory
+            self.single_observation_space = seen
+            self.observation_space = batch_space(seen, env.num_envs)
         self._mode = AutoresetMode(env.metadata["autoreset_mode"])
         self._ended = np.zeros(env.num_envs, dtype=bool)
+        warn_of(env, self._loops[0], links, self.step_time, chunk)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Any = None
@@ -117,7 +125,7 @@ class NetworkedVector(_Wrapper):
             return {"cloudrc": {"episode": loop.summary()}} if has_ended else {}
         last = info.pop("final_obs", observation), info.pop("final_info", {})
         loop.observe(*last)
-        seen, about = loop.seen
+        seen, about = loop.observed(), loop.seen[1]
         told = {**loop.told(), "episode": loop.summary()}
         loop.begin(None, observation, info)
         return {"final_obs": seen, "final_info": {**about, "cloudrc": told}}
@@ -126,11 +134,10 @@ class NetworkedVector(_Wrapper):
         """Return the newest observations and infos that the policies have."""
         seen, infos = list[Any](), dict[str, Any]()
         for n, loop in enumerate(self._loops):
-            observation, info = loop.seen
-            seen.append(copied(observation))
+            seen.append(loop.observed())
             told = loop.told() | finals[n].get("cloudrc", {})
-            self._add_info(infos, {**info, **finals[n], "cloudrc": told}, n)
-        return _batch(self.env.single_observation_space, seen), infos
+            self._add_info(infos, {**loop.seen[1], **finals[n], "cloudrc": told}, n)
+        return _batch(self.single_observation_space, seen), infos
 
 
 def _batch(space: Any, values: Sequence[Any]) -> Any:

@@ -30,7 +30,7 @@ class Counter(gymnasium.Env):
 class Mixed(gymnasium.Env):
     """Has spaces of every kind."""
 
-    metadata = {"render_fps": 50}  # noqa: RUF012
+    dt = 0.02
 
     def __init__(self):
         keys = spaces.Tuple((spaces.MultiBinary(2), spaces.MultiDiscrete([2, 3])))

@@ -139,12 +139,12 @@ def test_every_executor_takes_actions_of_several_values(name):
 def test_every_executor_says_what_it_is_and_forgets_the_last_episode(name):
     assert plugins.describe("executors", name).startswith("Executor: ")
     shaky = both_ways(20, 20, jitter_ms=15, loss=0.2)
-    env = Networked(Counter(), shaky, 3, chunk=4, executor=name)
+    env = Networked(Counter(), shaky, 3, chunk=5, executor=name)
 
     def fly():
         observation, _ = env.reset(seed=1)
         for _ in range(200):
-            observation, *_ = env.step(np.full((4, 1), observation[0], np.float32))
+            observation, *_ = env.step(np.full((5, 1), observation[0], np.float32))
         return [float(each[0]) for each in env.unwrapped.executed]
 
     assert fly() == fly()

@@ -7,11 +7,13 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 
 from cloudrc.errors import BadInputError
 from cloudrc.gym import Networked, NetworkedVector
+from cloudrc.gym.linear import Linear
 from tests.gym.envs import Counter, Mixed, both_ways, told
 from tests.support.programs import loaded
 from tests.tensors import KINDS, Tensor
@@ -100,13 +102,18 @@ def test_ages_and_the_worst_window_of_late_steps_and_of_steps_without_a_new_acti
     """
     silent = {"delay_ms": 10, "blackouts": [{"start_s": 0.13, "duration_s": 0.02}]}
     late = {"changes": [{"at_s": 0.3, "delay_ms": 20}]}
-    env = Networked(Counter(limit=40), {"downlink": {**silent, **late}}, 1, deadline=0.015)
-    found = told(env, 40)[-1]["episode"]
+    link = {"downlink": {**silent, **late}}
+
+    def flown(deadline):
+        return told(Networked(Counter(limit=40), link, 1, deadline=deadline), 40)[-1]["episode"]
+
+    found = flown(0.015)
     assert found["age_counts"] == [0, 27, 10, 1]
     names = ("action_age_mean", "action_age_max", "action_age_peak_mean", "observation_age_max")
     assert [found[name] for name in names] == pytest.approx([0.5 / 38, 0.03, 0.44 / 34, 0.0])
     assert found["late_share"] == pytest.approx(11 / 38)
-    assert [env.summary(limit)["misses_in_10"] for limit in (1.0, None, 0.005)] == [2, 9, 10]
+    missed = [flown(deadline)["misses_in_10"] for deadline in (1.0, 0.015, 0.005)]
+    assert missed == [2, 9, 10]
 
 
 @pytest.mark.filterwarnings("ignore::cloudrc.gym.doubts.LinkWarning")
@@ -144,6 +151,103 @@ def test_an_argument_that_cannot_be_used_is_refused_in_one_line():
     with pytest.raises(BadInputError, match=words) as caught:
         Networked(Counter(), executor="prefix")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("env", "call"),
+    [
+        (Networked(Counter()), lambda env: env.step(np.zeros(1))),
+        (Networked(Counter()), lambda env: env.summary()),
+        (NetworkedVector(SyncVectorEnv([Counter])), lambda env: env.step(np.zeros((1, 1)))),
+        (Linear(), lambda env: env.step(np.zeros(1))),
+    ],
+)
+def test_whatever_needs_an_episode_says_reset_before_the_first(env, call):
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) before"):
+        call(env)
+
+
+@pytest.mark.parametrize(
+    ("space", "executor"),
+    [
+        (spaces.Discrete(2), "ensemble"),
+        (spaces.Discrete(2), "async"),
+        (spaces.Box(0, 9, (2,), np.int64), {"name": "async", "aggregate": "average"}),
+        (spaces.Dict(a=spaces.Box(0, 1, (1,))), "ensemble"),
+    ],
+)
+def test_an_executor_that_computes_means_is_refused_for_other_actions(space, executor):
+    with pytest.raises(BadInputError, match="must be floating-point numbers"):
+        Networked(Counter(space), chunk=4, executor=executor)
+    Networked(Counter(space), chunk=4, executor={"name": "async", "aggregate": "latest"})
+
+
+LATE = both_ways(25, 20)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"compute": 20.0}, "an answer takes 20 s, an episode 5 s; times are in s"),
+        ({"link": both_ways(4000, 4000)}, "an answer takes 8 s, an episode 5 s"),
+        *(
+            ({"link": LATE, "executor": name, "chunk": 1}, "choose executor 'newest'")
+            for name in ("time_indexed", "ensemble", "prefix", "rtc", "async")
+        ),
+        ({"link": both_ways(90, 90), "executor": "prefix", "chunk": 3}, "few of them act, or none"),
+    ],
+)
+def test_episodes_in_which_no_answer_acts_are_told_when_they_are_made(options, words):
+    with pytest.warns(UserWarning, match=words):
+        Networked(gymnasium.make("Pendulum-v1", 100), **options)
+    with pytest.warns(UserWarning, match=words):
+        NetworkedVector(gymnasium.make_vec("Pendulum-v1", 2, max_episode_steps=100), **options)
+
+
+def test_what_can_act_is_not_told():
+    for name in ("time_indexed", "ensemble", "prefix", "rtc", "async"):
+        Networked(Counter(), LATE, chunk=6, executor=name, compute=0.004)
+    Networked(gymnasium.make("Pendulum-v1", 100), LATE, compute=2.0)
+
+
+def test_robots_that_meet_one_network_are_told_once_and_streams_part_them():
+    def begin(robots):
+        for env in robots:
+            env.reset()
+        for env in robots:
+            env.step(np.zeros(1))
+
+    with pytest.warns(UserWarning, match="seed=77 and stream='' meet one network") as told_once:
+        begin([Networked(Counter(), SHAKY, 77) for _ in range(4)])
+    assert len(told_once) == 1
+    begin([Networked(Counter(), SHAKY, 78, stream=f"robot{n}") for n in range(4)])
+    begin([Networked(Counter(), LATE, 79) for _ in range(2)])  # no number is drawn
+    for _ in range(2):  # one after the other, as an experiment's conditions
+        begin([Networked(Counter(), SHAKY, 80)])
+
+
+class Pond:
+    """No environment of gymnasium."""
+
+    observation_space = action_space = None
+
+
+@pytest.mark.parametrize(
+    ("wrap", "env", "words"),
+    [
+        (Networked, SyncVectorEnv([Counter]), "give it to NetworkedVector"),
+        (NetworkedVector, Counter(), "give it to Networked"),
+        (Networked, Pond(), "Pond is no environment of gymnasium; wrap"),
+        (
+            Networked,
+            type("Waterworld", (Pond,), {"__module__": "pettingzoo.sisl.waterworld"})(),
+            "Waterworld is no environment of gymnasium but one of PettingZoo, in which several",
+        ),
+    ],
+)
+def test_what_is_no_environment_of_this_kind_is_refused_by_its_name(wrap, env, words):
+    with pytest.raises(BadInputError, match=words):
+        wrap(env)
 
 
 def test_an_argument_of_the_environment_has_a_place_of_its_own():
@@ -221,9 +325,8 @@ def test_a_tensor_is_an_action_and_may_be_an_observation(kind):
 
 @pytest.mark.parametrize("space", [spaces.Discrete(5), spaces.Box(-9.0, 9.0, (2,))])
 def test_the_policy_may_observe_the_age_and_its_own_last_actions(space):
-    env = Networked(
-        Counter(space), both_ways(10, 20), observe_age=True, observe_actions=3, start="answer"
-    )
+    memory = {"observe_age": True, "observe_actions": 3, "observe_step": True}
+    env = Networked(Counter(space), both_ways(10, 20), start="answer", **memory)
     answers = [np.full(space.shape, n + 1, space.dtype)[()] for n in range(4)]
     nothing = np.zeros((3, *space.shape)).tolist()
     assert env.reset()[0]["actions"].tolist() == nothing
@@ -232,7 +335,7 @@ def test_the_policy_may_observe_the_age_and_its_own_last_actions(space):
         assert env.observation_space.contains(seen)
     assert seen["actions"][-1].tolist() == answers[0].tolist()
     assert seen["observation"] == [1.0]
-    assert seen["age"] == pytest.approx(0.01)
+    assert (seen["age"], seen["step"]) == (pytest.approx(0.01), 1.0)
     for answer in answers[2:]:
         seen, *_ = env.step(answer)
     assert seen["actions"].tolist() == [answers[n].tolist() for n in (0, 2, 3)]

@@ -31,11 +31,13 @@ class Executor:
 
     Attributes:
         needs_chunk: Whether single actions make no sense.
+        needs_floats: Whether it computes means of actions, in arrays of floating-point numbers.
         basis: Tick of the observation from which the last chosen action was computed; of several,
             their mean.
     """
 
     needs_chunk = True
+    needs_floats = False
     basis: float = -1
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
@@ -45,6 +47,13 @@ class Executor:
             ticks_late: Expected time from an observation to its answer, rounded up to ticks.
             period_ns: Time of a tick [ns].
         """
+
+    def doubt(self, count: int, ticks_late: int) -> str:
+        """Say why answers of `count` actions that arrive `ticks_late` ticks late make no sense.
+
+        Return "" if they do.
+        """
+        return ""
 
     def asks(self, tick: int, observation: Any) -> bool:
         """Return whether the robot sends the observation of this tick; by default, of each."""

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from cloudrc.gym.executors import Chunk
 from cloudrc.gym.executors._question import OneQuestion
 from cloudrc.outside.refusal import check_names
@@ -40,6 +38,7 @@ class Asynchronous(OneQuestion):
         check_names("aggregate", [aggregate], AGGREGATES)
         self._share: float = SHARE.of(share, "share")
         self._weight = AGGREGATES[aggregate]
+        self.needs_floats = self._weight != 1.0
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
         """Forget the last episode."""
@@ -48,6 +47,15 @@ class Asynchronous(OneQuestion):
         self._next = 0  # number of the next action
         self._numbers = {0: 0}  # tick of a question -> number of the first action of its answer
         self._size = 1  # of the newest answer
+
+    def doubt(self, count: int, ticks_late: int) -> str:
+        """Say that most steps have no action, if an answer has a single one."""
+        if count > 1 or not ticks_late:
+            return ""
+        return (
+            "an answer has one action, and the robot has no other until the next answer; answer "
+            "with more actions, or choose executor 'newest'"
+        )
 
     def wants(self, tick: int) -> bool:
         """Return whether few actions are left."""
@@ -76,11 +84,6 @@ class Asynchronous(OneQuestion):
         """Return an action between an older and a newer one."""
         if self._weight == 1.0:
             return action
-        if np.asarray(action).dtype.kind != "f":
-            raise ValueError(
-                "executor 'async' computes means of actions, which must be floating-point numbers; "
-                "for other actions give aggregate=latest"
-            )
         return (1.0 - self._weight) * before + self._weight * action
 
     def action(self, tick: int) -> Any:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from cloudrc.gym.executors import Chunk, Executor
+from cloudrc.gym.executors.time_indexed import TimeIndexed
 
 DECAY = 0.01
 """How fast the weight falls from an older answer to the next newer one [1]."""
@@ -20,17 +21,15 @@ DECAY = 0.01
 class Ensemble(Executor):
     """Keeps all answers with an action for the tick; jumps between answers become small."""
 
+    needs_floats = True
+    doubt = TimeIndexed.doubt
+
     def begin(self, ticks_late: int, period_ns: int) -> None:
         """Forget the last episode."""
         self._chunks: list[Chunk] = []
 
     def receive(self, chunk: Chunk, tick: int) -> None:
         """Keep the answer."""
-        if np.asarray(chunk.actions[0]).dtype.kind != "f":
-            raise ValueError(
-                "executor 'ensemble' computes means of actions, which must be floating-point "
-                "numbers; use 'time-indexed' for other actions"
-            )
         self._chunks.append(chunk)
         self._chunks.sort(key=lambda each: each.basis)
 
@@ -43,7 +42,8 @@ class Ensemble(Executor):
         weights = [exp(-DECAY * place) for place in range(len(meant))]
         bases = [each.basis for each in self._chunks]
         self.basis = float(np.average(bases, weights=weights))
-        return np.average(meant, axis=0, weights=weights).astype(meant.dtype)
+        mean = np.average(meant, axis=0, weights=weights)
+        return mean.astype(meant.dtype) if meant.dtype.kind == "f" else mean
 
 
 build = Ensemble
