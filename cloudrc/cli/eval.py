@@ -51,6 +51,14 @@ def arguments(parser: Parser) -> None:
     add("--compute", "TIME", f"{about} (default: 0)", "0")
     about = "how long the robot waits in a step for an answer, in s (default: 5 %% of it)"
     add("--answer-within", "S", about, read=number(0, 3600, "seconds"))
+    about = "action before the first answer; 'none': 0; 'answer': the robot waits for it (default)"
+    add("--start", "ACTION", about, "answer")
+    about = "without an action, the robot repeats its last or executes that of --start"
+    add("--hold", None, about, "repeat", choices=("repeat", "start"))
+    add("--observe-age", "", "the policy observes the age of its observation, too")
+    about = "how many of its own last actions the policy observes, too (default: 0)"
+    add("--observe-actions", "N", about, 0, whole_number(0, 1000))
+    add("--observe-step", "", "the policy observes the step of its observation, too")
     add("--seeds", "N", "seeds 1 to N of each condition (default: 20)", 20, read_count)
     add("--map", "FILE", "file from the environment's observation to the policy's (YAML)")
     about = "smallest return of a success (default: what the info says)"
@@ -81,8 +89,7 @@ def _round_trips(text: str) -> tuple[float, ...]:
 
 def execute(options: Options) -> int:
     """Play what is missing, write the report, and print the table."""
-    needed = ["gym", "report", *(["policy"] if "://" in options.policy else [])]
-    require("an evaluation", needed)
+    require("an evaluation", ["gym", "report", *(["policy"] if "://" in options.policy else [])])
     from cloudrc.cli.progress import Progress
     from cloudrc.eval import results
     from cloudrc.eval.episode import check_environment
@@ -95,8 +102,9 @@ def execute(options: Options) -> int:
         with naming(f"--out {folder}"):
             results.check_folder(folder, setup)
     with Progress(f"makes the environment {setup.env}"):
-        setup = check_environment(setup, episodes)
-    for text in _warnings(setup, episodes):
+        setup, doubts = check_environment(setup, episodes)
+    doubts += [f"--env {setup.env}: {results.SEEDLESS}"] * (not setup.follows_seed)
+    for text in doubts:
         tell(f"warning: {text}")
     episodes = [*(Episode(None, BASELINE, n + 1) for n in range(options.seeds)), *episodes]
     known = results.read_before(folder, setup) if goes_on else results.Before()
@@ -129,15 +137,6 @@ def execute(options: Options) -> int:
     text = f"{results.as_text(document)}\n{escape(str(page))}"
     print_result(options.output, document, text, **tables)
     return 0
-
-
-def _warnings(setup: EvalSetup, episodes: list[Episode]) -> list[str]:
-    """Say what makes episodes pointless, before they are played."""
-    from cloudrc.eval.episode import describe_doubts
-    from cloudrc.eval.results import SEEDLESS
-
-    seedless = [] if setup.follows_seed else [f"--env {setup.env}: {SEEDLESS}"]
-    return [*seedless, *describe_doubts(setup)]
 
 
 def _versus(
@@ -209,6 +208,11 @@ def _read(options: Options) -> tuple[EvalSetup, list[Episode]]:
         deadline=options.deadline,
         delivery=options.delivery or ("stream" if "://" in options.policy else "datagrams"),
         packet_bytes=options.packet_bytes,
+        start=values.read_start(options.start),
+        hold=options.hold,
+        observe_age=options.observe_age,
+        observe_actions=options.observe_actions,
+        observe_step=options.observe_step,
     )
     values.check_policy(setup.policy)
     values.check_rows(options.rows)

@@ -11,6 +11,7 @@ from typing import Any
 from cloudrc.config.compute import read_times
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.eval.setup import FILE, MEASURED, SEED, Compute
+from cloudrc.gym.options import ANSWER
 from cloudrc.link.library import read_profile
 from cloudrc.outside.document import parse_value, read_document
 from cloudrc.outside.paths import check_new
@@ -96,6 +97,16 @@ def read_compute(text: str) -> tuple[Compute, tuple[float, ...]]:
 def read_env_args(texts: list[str]) -> tuple[tuple[str, Any], ...]:
     """Read arguments of an environment, given as KEY=VALUE; a value is YAML, also with None."""
     return tuple(sorted(_pairs("--env-arg", texts, "env_name=reach-v3").items()))
+
+
+def read_start(text: str) -> Any:
+    """Read the action before the first answer: None, ANSWER, or a number or a list."""
+    value = None if text == "none" else parse_value(text, "--start")
+    if isinstance(value, str) and value != ANSWER:
+        raise BadInputError(
+            f"--start {text}: give '{ANSWER}', 'none', or an action such as 0 or [0.5, 0]"
+        )
+    return value
 
 
 def read_parameters(

@@ -17,6 +17,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from cloudrc import source
@@ -24,12 +25,12 @@ from cloudrc.errors import CloudrcError
 from cloudrc.eval.environment import environment_code, find_module
 from cloudrc.eval.setup import BARE, SEED, Episode, EvalSetup, link_at
 from cloudrc.gym import Networked
-from cloudrc.gym.doubts import LinkWarning, doubts
+from cloudrc.gym.options import ANSWER
 from cloudrc.gym.step import find_step
 from cloudrc.gym.values import leaves, size_of
 from cloudrc.outside.code import calling
 from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import RESULT, InvalidValueError, to_arrays, to_boolean
+from cloudrc.outside.values import ANY, RESULT, InvalidValueError, to_arrays, to_boolean
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
 from cloudrc.policy.observation import observe
@@ -107,6 +108,7 @@ def play(episode: Episode, setup: EvalSetup, key: str = "") -> dict[str, Any]:
         "numbers": {k: v for k, v in numbers.items() if v is not None and isfinite(v)},
         "age_counts": loop["age_counts"],
         "link_start": loop["link_start"],
+        "doubts": loop["doubts"],
         "records_sha256": digest if setup.is_repeatable else "",
         "code": source.code_hash(),
     }
@@ -167,7 +169,7 @@ class _Policy:
         self._width, self._may_switch = width_of(space), not isinstance(space, spaces.Box)
         self._count: int | None = None
         self.duration = 0.0  # of the last answer [s]
-        self.size = 0  # of the last observation on the wire [bytes]
+        self.size = 0  # of the last observation on the wire, without memory [bytes]
 
     def __call__(
         self, observation: Any, prefix: Sequence[Any] = (), delay: int = 0
@@ -178,7 +180,7 @@ class _Policy:
         its observation.
         """
         asked = observe(observation, self._setup.mapped)
-        self.size = size_of(asked)
+        self.size = _sent_size(observation, self._setup)
         if prefix:
             asked["prefix"] = np.array(prefix).reshape(len(prefix), -1)
             asked["delay"] = delay
@@ -236,9 +238,9 @@ def _play(
     if the environment does not tell.
     """
     witness, policy = _Witness(env), _Policy(ask, setup, env.action_space)
-    observation, _ = witness.reset(seed=episode.seed)
+    observation, _ = Networked(witness, **_beginning(setup, env)).reset(seed=episode.seed)
     chunk = policy(observation)  # the first answer, whose size the link has to know
-    world = _connect(witness, episode, setup, policy, len(chunk))
+    world, doubts = _connect(witness, episode, setup, policy, len(chunk))
     witness.digest = sha256()
     observation, info = world.reset(seed=episode.seed)
     if times := setup.times:
@@ -275,21 +277,23 @@ def _play(
         "stale_share": stale / steps,
         "seam_jump": fmean(jumps) if jumps else None,
     }
-    return ended, success, witness.digest.hexdigest(), numbers, world.summary()
+    loop = {**world.summary(), "doubts": doubts}
+    return ended, success, witness.digest.hexdigest(), numbers, loop
 
 
 def _connect(
     env: gymnasium.Env[Any, Any], episode: Episode, setup: EvalSetup, policy: _Policy, count: int
-) -> Networked:
-    """Put the link between environment and policy, which has answered with `count` actions."""
+) -> tuple[Networked, list[str]]:
+    """Put the link between environment and policy, which has answered with `count` actions.
+
+    Also return what `Networked` warns of.
+    """
     sent = setup.observation_bytes
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LinkWarning)  # `describe_doubts` tells it once
-        return Networked(
+    with _hearing() as doubts:
+        world = Networked(
             env,
             link_at(setup.link, episode.rtt_ms),
             episode.seed,
-            dt=setup.dt,
             compute=policy.duration if setup.is_measured else setup.compute_times,
             answer_within=setup.answer_within,
             deadline=setup.deadline,
@@ -298,8 +302,33 @@ def _connect(
             observation_bytes=policy.size if sent is None else sent,
             delivery=setup.delivery,
             packet_bytes=setup.packet_bytes,
-            start="answer",  # a robot does nothing before its policy has answered
+            **_beginning(setup, env),
         )
+    return world, doubts
+
+
+def _beginning(setup: EvalSetup, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    """Return the arguments of `Networked` that the first observation depends on."""
+    start, space = setup.start, env.action_space
+    if start not in (None, ANSWER):
+        with naming("--start", "'answer', 'none', or an action"):
+            row = ANY.row(start if isinstance(start, list) else [start], width_of(space))
+            try:
+                start = as_actions(np.array([row]), space)[0]
+            except PolicyAnswerError as error:
+                raise InvalidValueError(str(error)) from None
+    dt = setup.step.seconds if setup.step else setup.dt
+    return {"dt": dt, "start": start, "hold": setup.hold, **setup.memory}
+
+
+@contextmanager
+def _hearing() -> Iterator[list[str]]:
+    """Yield a list that has what was warned of, once the block is over."""
+    found = list[str]()
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        yield found
+    found += dict.fromkeys(str(each.message) for each in seen)
 
 
 def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
@@ -311,38 +340,48 @@ def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
     return known
 
 
-def check_environment(setup: EvalSetup, episodes: list[Episode]) -> EvalSetup:
+def check_environment(setup: EvalSetup, episodes: list[Episode]) -> tuple[EvalSetup, list[str]]:
     """Return the setup with what is known about the environment; check policy and executors.
 
-    The call comes before a folder is made. A server is not asked.
+    Also return what makes episodes pointless, as far as it is known without an answer. The call
+    comes before a folder is made. A server is not asked.
     """
     with make_env(setup, 1) as env:
         with naming(f"--env {setup.env}"):
             width_of(env.action_space)
             step = find_step(env, setup.dt)
-        code = environment_code(env, setup)
+        setup = replace(setup, step=step, env_code=environment_code(env, setup))
+        given = _beginning(setup, env)
         for episode in {each.point["executor"]: each for each in episodes}.values():
             wait = setup.answer_within
-            Networked(env, dt=setup.dt, chunk=1, executor=episode.chosen, answer_within=wait)
+            Networked(env, chunk=1, executor=episode.chosen, answer_within=wait, **given)
+        digest, size = _first_observation(env, setup)
+        if setup.observation_bytes is not None:
+            size = setup.observation_bytes
+        setup = replace(setup, sent_bytes=size)
+        given |= {"delivery": setup.delivery, "packet_bytes": setup.packet_bytes}
+        given |= {"compute": 0.0 if setup.is_measured else setup.compute_times}
+        limited = TimeLimit(env, setup.max_steps)
+        with _hearing() as doubts:
+            for rtt in sorted({each.rtt_ms for each in episodes}, key=str):
+                Networked(limited, link_at(setup.link, rtt), observation_bytes=size, **given)
     if not setup.is_remote:
         _load(setup.policy)
-    digests, sizes = zip(*(_first_observation(setup) for _ in range(2)), strict=True)
-    size = sizes[0] if setup.observation_bytes is None else setup.observation_bytes
-    same = digests[0] == digests[1]
-    return replace(setup, follows_seed=same, env_code=code, step=step, sent_bytes=size)
-
-
-def _first_observation(setup: EvalSetup) -> tuple[str, int]:
-    """Return hash and size [bytes] of the observation with which the seed 1 begins."""
     with make_env(setup, 1) as env:
-        witness = _Witness(env)
-        observation, _ = witness.reset(seed=1)
-        return witness.digest.hexdigest(), size_of(observe(observation, setup.mapped))
+        follows_seed = _first_observation(env, setup)[0] == digest
+    return replace(setup, follows_seed=follows_seed), doubts
 
 
-def describe_doubts(setup: EvalSetup) -> list[str]:
-    """Say what makes observations over the link useless: few arrive, or their rate is too high."""
-    assert setup.sent_bytes is not None
-    assert setup.step is not None
-    wires = [setup.wire(setup.sent_bytes, uplink=True)]
-    return list(doubts(wires, setup.step.seconds, asks_always=True))
+def _first_observation(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> tuple[str, int]:
+    """Return hash and size [bytes] of the observation with which the seed 1 begins."""
+    witness = _Witness(env)
+    observation, _ = Networked(witness, **_beginning(setup, env)).reset(seed=1)
+    return witness.digest.hexdigest(), _sent_size(observation, setup)
+
+
+def _sent_size(observation: Any, setup: EvalSetup) -> int:
+    """Return the size of an observation on the wire [bytes]: without memory, which is not sent."""
+    sent = observation
+    if any(setup.memory.values()):
+        sent = {key: () for key in observation} | {"observation": observation["observation"]}
+    return size_of(observe(sent, setup.mapped))

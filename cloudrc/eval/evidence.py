@@ -60,7 +60,8 @@ def summarize(rtt_ms: float | None, executor: str, rows: Sequence[Row]) -> dict[
     Medians and rates have their 95 % interval: `_low` and `_high`. Means of steps are pooled, and
     `_of` is the number of steps. Of the missed steps the worst window counts, of ages also the
     largest. Ages and delays are
-    in ms, `age_counts` has steps. What is not known is left out.
+    in ms, `age_counts` has steps. `unanswered` are the episodes that ended before a second answer
+    could act. What is not known is left out.
     """
     numbers: list[Mapping[str, float]] = [row["numbers"] for row in rows]
     ends, count = [row["ended"] for row in rows], len(rows)
@@ -76,6 +77,7 @@ def summarize(rtt_ms: float | None, executor: str, rows: Sequence[Row]) -> dict[
             found[f"{name}{unit}"] = max(known) * factor
     counts = (row.get("age_counts", ()) for row in rows)
     found["age_counts"] = list(map(sum, zip_longest(*counts, fillvalue=0)))
+    found["unanswered"] = sum("loop_age" not in each for each in numbers)
     found |= {end: ends.count(end) for end in ("terminated", "truncated", "limit")}
     return {**found, "terminated_share": found["terminated"] / count, **dict(_means(numbers))}
 
@@ -214,7 +216,7 @@ def judge(
         notes.append(SEEDS_CHANGED.format(", then ".join(map(str, seeds))))
     intervals = [key for each in outcomes for key in each if key.endswith("_low")]
     count = len(intervals) + sum(len(each.keys() & {"success", "return"}) for each in tests)
-    notes += doubts(outcomes)
+    notes += [*beginnings(outcomes), *doubts(outcomes), *told(groups)]
     if count > 1:
         notes.append(by_chance(count))
     return {
@@ -224,6 +226,31 @@ def judge(
         "tests": tests,
         "notes": notes,
     }
+
+
+def beginnings(outcomes: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Count the episodes over a network that ended before a second answer could act."""
+    found = [
+        f"{each['executor']} at {place(each['rtt_ms'])} {each['unanswered']} of {each['episodes']}"
+        for each in outcomes[1:]
+        if each["unanswered"]
+    ]
+    if found:
+        yield (
+            "episodes that ended before a second answer could act tell of their beginning "
+            f"(--start), not of the policy: {', '.join(found)}"
+        )
+
+
+def told(groups: Groups) -> Iterator[str]:
+    """Repeat what `Networked` warned of, with the conditions."""
+    found = dict[str, dict[str, None]]()
+    for executor, at in groups.items():
+        for rtt, rows in at.items():
+            for text in (text for row in rows for text in row.get("doubts", ())):
+                found.setdefault(text, {})[f"{executor} at {place(rtt)}"] = None
+    for text, where in found.items():
+        yield f"{', '.join(where)}: {text}"
 
 
 def doubts(outcomes: Sequence[Mapping[str, Any]]) -> Iterator[str]:

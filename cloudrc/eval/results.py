@@ -41,6 +41,8 @@ PAIRED = (
     "observation_bytes",
     "delivery",
     "packet_bytes",
+    "start",
+    "hold",
 )
 """What two evaluations must share for a comparison of their policies."""
 FLAGS = {"delivery": "--delivery", "packet_bytes": "--packet-bytes"}

@@ -12,6 +12,7 @@ from statistics import fmean
 from typing import Any
 
 from cloudrc.gym.lane import DATAGRAMS, Wire
+from cloudrc.gym.options import ANSWER
 from cloudrc.gym.step import StepTime
 from cloudrc.link.library import PACKET_BYTES, LinkProfile, read_profile
 from cloudrc.link.profile import DirectionProfile
@@ -63,6 +64,11 @@ class EvalSetup:
     delivery: str = DATAGRAMS  # of messages, as `Networked` takes it
     packet_bytes: int = PACKET_BYTES  # most bytes of a packet
     sent_bytes: int | None = None  # of the first observation on the wire; None: not known yet
+    start: Any = ANSWER  # action before the first answer, as `Networked` takes it; a list is one
+    hold: str = "repeat"  # what the robot executes without an action, as `Networked` takes it
+    observe_age: bool = False  # what the policy observes beside its observation, likewise
+    observe_actions: int = 0
+    observe_step: bool = False
 
     @property
     def is_remote(self) -> bool:
@@ -78,6 +84,11 @@ class EvalSetup:
     def is_measured(self) -> bool:
         """Whether the time for an answer is measured."""
         return self.compute == (MEASURED, "")
+
+    @property
+    def memory(self) -> dict[str, Any]:
+        """What the policy observes beside its observation, as `Networked` takes it."""
+        return {name: value for name, value in vars(self).items() if name.startswith("observe_")}
 
     @property
     def compute_times(self) -> Any:

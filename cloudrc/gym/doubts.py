@@ -9,7 +9,7 @@ from cloudrc.link.profile import Timeline, whole_share
 
 
 class LinkWarning(UserWarning):
-    """A link and the messages that cross it do not fit together."""
+    """Episodes over a link tell little of the policy, or rest on a guess."""
 
 
 def doubts(wires: Iterable[Wire], dt: float, *, asks_always: bool) -> Iterator[str]:

@@ -62,24 +62,23 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             env: The environment.
             link: Link profile: its name, path or keys; a list of these, or a function (gym.md).
             seed: Seed of the network, whose episode `reset(seed=...)` selects.
-            compute: Time that the policy needs for an answer [s], in which it takes no other
-                observation; or a pair, mean and standard deviation of a gamma distribution.
+            compute: Time for an answer [s]; or mean and deviation of a gamma distribution.
             answer_within: Time for which the robot waits in a step for an answer [s]; None: 5 %.
             deadline: Age of an action [s] above which the summary counts a step as late.
             chunk: Number of actions in an answer, from the observation's tick on; None: only one.
-            executor: How the robot executes answers: the name of a plug-in, or the path of a file.
+            executor: How the robot executes answers: name of a plug-in, or path of a file.
             hold: Without an action it executes the last one, "repeat", or `start`, "start".
             start: Action before the first answer arrives; None: 0, or what is nearest to it;
-                "answer": the robot waits for the first answer, and the episode begins then.
+                "answer": the episode begins when the robot has its first answer.
             observation_bytes, action_bytes: Sizes on the wire [bytes]; None: those of the arrays.
             delivery: "datagrams": a lost packet loses its message; "stream": it makes it late.
-            packet_bytes: Most bytes of a packet; a larger message is several packets.
+            packet_bytes: Most bytes of a packet of a message.
             dt: Time of a step [s]; None: that of the environment.
-            stream: Name of the robot; robots with one seed and two names share no random numbers.
+            stream: Name of the robot, which with the seed selects its random numbers.
             observe_age: Whether the policy also observes the age of its observation [s].
             observe_actions: How many of its last actions it also observes; of chunks, the first.
-            observe_step: Whether it also observes in which step its observation was taken. With any
-                of the three, observations are mappings, as those of `Remembering`.
+            observe_step: Whether it also observes the step of its observation. With any of the
+                three, observations are mappings, as those of `Remembering`.
 
         Raises:
             cloudrc.errors.CloudrcError: If a value cannot be used; the text says what to change.
@@ -88,15 +87,15 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, link=link, seed=seed, dt=dt, stream=stream, **options)
         check_kind(env, gymnasium.Env, "environment")
         gymnasium.Wrapper.__init__(self, env)
-        self.step_time = find_step(env, dt)
+        self.step_time, chunk = find_step(env, dt), options["chunk"]
         self.dt = self.step_time.seconds
-        both = env.observation_space, env.action_space
-        (self._loop,), links = connect(both, self.dt, link, seed, (stream,), options)
-        self.action_space, self._split = answer_space(env.action_space, options["chunk"])
-        self._check = checker(self.action_space, describe_answer(options["chunk"]))
+        spaces = env.observation_space, env.action_space
+        (self._loop,), links = connect(spaces, self.dt, link, seed, (stream,), options)
+        self.action_space, self._split = answer_space(env.action_space, chunk)
+        self._check = checker(self.action_space, describe_answer(chunk))
         self.observation_space = self._loop.memory.space
         self.world_info: dict[str, Any] = {}
-        warn_of(env, self._loop, links, self.step_time, options["chunk"])
+        warn_of(env, self._loop, links, self.step_time, chunk)
 
     @property
     def compute(self) -> Callable[[int], float]:
