@@ -136,7 +136,7 @@ def arguments(parser: Parser) -> None:
     add("x", "X", about, read=metres)
     add("y", "Y", about, read=metres)
     add("z", "Z", f"{about}; none for a robot on the ground", read=metres, nargs="?")
-    about = "heading there [deg], for a robot that obeys a yaw"
+    about = "heading there [deg], for a robot that can turn"
     add("--yaw", "DEG", about, read=number(-360, 360, "degrees"))
 
 

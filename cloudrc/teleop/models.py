@@ -80,7 +80,7 @@ class GoToRequest(Section):
     position_m: Place
     """Base position [m], world frame"""
     yaw_deg: Yaw | None = None
-    """Heading there [deg], for a robot that obeys a yaw; null: any"""
+    """Heading there [deg], for a robot that can turn; null: any"""
 
 
 class DriveRequest(Section):
@@ -343,15 +343,18 @@ class RequestReader:
     def goto(self, body: bytes) -> Leg:
         """Read a point."""
         request = _parse(body, GoToRequest)
-        waypoint = Waypoint(position_m=request.position_m, yaw_deg=request.yaw_deg)
+        # A robot that turns towards its velocity turns on the spot once it is there.
+        on_the_spot = request.yaw_deg if self._robot.heading == "velocity" else None
+        yaw_deg = request.yaw_deg if on_the_spot is None else None
+        waypoint = Waypoint(position_m=request.position_m, yaw_deg=yaw_deg)
         # What is an obstacle depends on the mission under way; the service checks the way there.
         mission = MissionConfig(start="here", waypoints=(waypoint,), touch=self.touch)
         mission = put_on_ground(mission, self.world)
         if problems := check_mission(mission, self.world):
             raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
         (waypoint,) = without_held_yaws(mission, self._robot.heading).waypoints
-        yaw = None if waypoint.yaw_deg is None else radians(waypoint.yaw_deg)
-        return Leg(waypoint.position_m, yaw)
+        yaw_deg = waypoint.yaw_deg if on_the_spot is None else on_the_spot
+        return Leg(waypoint.position_m, None if yaw_deg is None else radians(yaw_deg))
 
     def drive(self, body: bytes) -> tuple[Vector, float | None]:
         """Read a velocity [m/s] and a yaw rate [rad/s]."""

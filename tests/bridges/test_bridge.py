@@ -34,6 +34,7 @@ from tests.support.told import told
 
 STORE = get_typestore(Stores.ROS2_KILTED)
 LEFT = (2**-0.5, 0.0, 0.0, 2**-0.5)
+ANY = (0.0, 0.0, 0.0, 0.0)
 """Orientation: turned by 90 degrees to the left."""
 
 
@@ -56,8 +57,13 @@ class Asking:
     ("options", "z", "goal", "said"),
     [
         ({}, 1.5, {"position_m": [1.0, 2.0, 1.5], "yaw_deg": 90.0}, "(1, 2, 1.5)"),
-        ({"heading": "velocity"}, 0.0, {"position_m": [1.0, 2.0, 1.7]}, "(1, 2, 1.7)"),
-        ({"heading": "velocity", "planar": True}, 0.0, {"position_m": [1.0, 2.0]}, "(1, 2)"),
+        ({}, 0.0, {"position_m": [1.0, 2.0, 1.7], "yaw_deg": 90.0}, "(1, 2, 1.7)"),
+        (
+            {"heading": "velocity", "planar": True},
+            0.0,
+            {"position_m": [1.0, 2.0], "yaw_deg": 90.0},
+            "(1, 2)",
+        ),
     ],
 )
 def test_a_goal_is_a_goto_with_its_yaw_which_on_the_ground_keeps_the_height(options, z, goal, said):
@@ -188,13 +194,13 @@ class Pilot(Asking):
         del self.states[: len(self.states) > 1]
         return {"mission": mission} if path == "/v1/state" else mission
 
-    def fly(self, goal=(1.0, 0.0, 1.0)):
+    def fly(self, goal=(1.0, 0.0, 1.0), wxyz=UPRIGHT):
         def tell(*given):
             self.fed.append(given)
             self.requests.see((0.8 + 0.1 * len(self.fed), 0.0, 1.0), UPRIGHT)
 
         navigation = Navigation(self.api, self.requests)
-        return navigation.fly(("map", goal, UPRIGHT), lambda: self.wants_end, tell)
+        return navigation.fly(("map", goal, wxyz), lambda: self.wants_end, tell)
 
 
 def test_to_navigate_is_to_fly_a_mission_to_its_end(monkeypatch):
@@ -216,6 +222,23 @@ def test_a_goal_beside_a_held_mission_ends_there_and_a_cancelled_one_here(monkey
         pilot.wants_end = True
         assert pilot.fly((9.0, 0.0, 1.0)) == "cancelled"
         assert pilot.api.posted[-1][0] == path
+
+
+@pytest.mark.parametrize(("wxyz", "ends"), [(UPRIGHT, True), (LEFT, False)])
+def test_a_goal_beside_a_held_mission_ends_with_its_heading(monkeypatch, wxyz, ends):
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    monkeypatch.setattr("cloudrc.bridges.ros2.mission.DWELL", 0.0)
+    pilot = Pilot(["held", *["held"] * 4, "flying"])
+    assert (pilot.fly(wxyz=wxyz) == "") == ends
+
+
+@pytest.mark.parametrize(("wxyz", "goes"), [(UPRIGHT, True), (ANY, True), (LEFT, False)])
+def test_a_robot_that_cannot_turn_answers_so_when_the_goal_comes(wxyz, goes):
+    asking = Asking(heading="fixed")
+    why = asking.requests.go_to("map", (1.0, 2.0, 1.0), wxyz)
+    assert ("holds the yaw at 0" in why) is not goes
+    goal = ("/v1/goto", {"position_m": [1.0, 2.0, 1.0]})
+    assert asking.api.posted == [goal] * goes
 
 
 def test_a_refused_goal_is_not_flown():

@@ -6,6 +6,8 @@ import threading
 import time
 from contextlib import closing, contextmanager
 from importlib.util import find_spec
+from math import atan2, degrees
+from pathlib import Path
 from shutil import which
 
 import pytest
@@ -215,11 +217,16 @@ def nav2_controller(command):
     command.twist.linear.x, command.twist.angular.z = 0.3, -0.4
 
 
+def state_of(mission):
+    """Return the state of a mission, as the topic tells it."""
+    return {each.key: each.value for each in mission.values}.get("state", "")
+
+
 @contextmanager
 def session(folder, monkeypatch, *words, flags=()):
     """Begin a session and its bridge, which has to end with it."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
-    flown = start(folder, "up", *words)
+    flown = start(folder, "up", "--report", "none", *words)
     assert any("to end" in said for said in flown.stdout), "the session has not begun"
     command = start(folder, "ros", "bridge", *flags)
     try:
@@ -257,7 +264,46 @@ def test_the_messages_of_teleop_keyboard_and_of_nav2_turn_a_rover(tmp_path, monk
             assert sum(rates[10:]) / 20 == pytest.approx(wanted, rel=0.25)
             commands.publish(kind())
             watcher.node.destroy_publisher(commands)
-        assert "held" in {each.key: each.value for each in got["mission"][-1].values}["state"]
+        assert "held" in state_of(got["mission"][-1])
+
+
+@pytest.mark.skipif(not which("g++"), reason="needs g++")
+@pytest.mark.usefixtures("nav2")
+@pytest.mark.parametrize("asked", ["topic", "action"])
+def test_a_goal_with_a_yaw_turns_a_rover(tmp_path, monkeypatch, asked):
+    """It arrives, and turns on the spot."""
+    from diagnostic_msgs.msg import DiagnosticStatus
+    from geometry_msgs.msg import PoseStamped
+    from nav2_msgs.action import NavigateToPose
+    from nav_msgs.msg import Odometry as RosOdometry
+    from rclpy.action import ActionClient
+
+    package = Path(find_spec("nav2_msgs").submodule_search_locations[0])
+    monkeypatch.setenv("PYTHONPATH", str(package.parent))  # for the bridge, too
+    watcher = Watcher(odom=("/odom", RosOdometry), mission=("/cloudrc/mission", DiagnosticStatus))
+    client = ActionClient(watcher.node, NavigateToPose, "/navigate_to_pose")
+    goals, got = watcher.node.create_publisher(PoseStamped, "/goal_pose", 1), watcher.got
+    goal = PoseStamped()
+    goal.pose.position.x, turn = 1.0, goal.pose.orientation
+    turn.z = turn.w = 0.5**0.5  # 90 degrees
+    ground = "pillars", "--set", "world.scene=empty"
+    with closing(watcher), session(tmp_path, monkeypatch, *ground):
+        watcher.wait(lambda: len(got["odom"]) > 10 and goals.get_subscription_count(), 60.0)
+        if asked == "topic":
+            goals.publish(goal)
+            watcher.wait(lambda: got["mission"] and "done" in state_of(got["mission"][-1]), 60.0)
+        else:
+            watcher.wait(client.server_is_ready, 20.0)
+            sent = client.send_goal_async(NavigateToPose.Goal(pose=goal))
+            watcher.wait(sent.done)
+            ended = sent.result().get_result_async()
+            watcher.wait(ended.done, 60.0)
+            assert ended.result().status == SUCCEEDED
+        pose = got["odom"][-1].pose.pose
+        assert (pose.position.x, pose.position.y) == pytest.approx((1.0, 0.0), abs=0.1)
+        yaw = 2.0 * degrees(atan2(pose.orientation.z, pose.orientation.w))
+        assert yaw == pytest.approx(90.0, abs=6.0)  # 5 when it was judged
+        client.destroy()
 
 
 def test_the_bridge_of_a_session_ends_with_it(tmp_path, monkeypatch):

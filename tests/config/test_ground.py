@@ -1,6 +1,7 @@
 """Missions of a robot on the ground: two numbers are enough, heights are refused with a word."""
 
 from functools import partial
+from math import pi
 
 import pytest
 
@@ -77,5 +78,7 @@ def test_teleop_takes_two_numbers_and_refuses_heights():
     with pytest.raises(RefusedError, match="has a height"):
         read.order(b'{"waypoints": [{"position_m": [1.5, 1.2, 1.0]}]}')
     assert read.goto(b'{"position_m": [1, 1.2]}').position == (1.0, 1.2, 0.1)
+    turned = read.goto(b'{"position_m": [1, 1.2], "yaw_deg": 180}')
+    assert turned.yaw == pytest.approx(pi), "it turns on the spot"
     with pytest.raises(RefusedError, match=r"position_m: .* has a height"):
         read.goto(b'{"position_m": [1, 1.2, 1]}')

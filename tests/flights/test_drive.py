@@ -1,5 +1,7 @@
 """Driving by hand over a link: latency, an operator who is lost, stops, and the flight again."""
 
+from math import radians
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from cloudrc.records import Arrival, CommandApplied, Control, TelemetrySent
 from cloudrc.report.document import Run
 from cloudrc.report.write import write_report
 from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.wire import Leg
 from tests.conftest import nightly
 from tests.flights.conftest import fly
 
@@ -116,6 +119,19 @@ def test_a_robot_that_is_asked_to_turn_drives_a_circle(robot, velocity, turn):
         if 4.0 < time < 5.0
     ]
     assert np.mean(ahead) == pytest.approx(velocity[0], rel=0.1, abs=0.01)
+
+
+@pytest.mark.parametrize("degree", [90, -170])
+@pytest.mark.parametrize("place", [(1.0, 0.0), (-0.6, 0.8)])
+def test_a_rover_goes_to_a_goal_and_turns_there(degree, place):
+    drive = Drive(robot="rover")
+    leg = Leg((*place, 0.1), radians(degree))
+    drive.at(2.0, lambda service, now_ns: service.go_to(leg, now_ns))
+    drive.fly(12.0)
+    assert drive.flight.events("done")
+    seen = drive.records[TelemetrySent][-1].telemetry.odometry  # at rest, seconds later
+    assert seen.position[:2] == pytest.approx(place, abs=0.1)
+    assert abs(turn_to(leg.yaw, seen.orientation_wxyz)) < radians(5.0)
 
 
 def test_a_drive_can_be_flown_again(tmp_path):

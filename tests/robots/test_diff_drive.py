@@ -66,6 +66,8 @@ def test_at_rest_it_turns_with_the_yaw_rate_and_while_it_drives_the_velocity_dec
     turned = drive((0.0, 0.0, 0.0, 0.5))
     assert turned.readings.angular_velocity_body[2] == pytest.approx(0.5, abs=0.05)
     assert hypot(*turned.readings.position[:2]) < 0.01
+    near = drive((0.0, 0.04, 0.0, 0.5))  # a few centimetres beside the goal
+    assert heading(near) == pytest.approx(1.0, abs=0.1)
     assert abs(heading(drive((0.8, 0.0, 0.0, 0.5)))) < 0.01
 
 

@@ -95,7 +95,8 @@ class Navigation:
         while self._newest == number:
             now, away = time.monotonic(), self._requests.distance
             tell(self._requests.position, away, now - began)
-            near_since = min(near_since, now) if away <= ARRIVED else inf
+            is_there = away <= ARRIVED and self._requests.has_heading
+            near_since = min(near_since, now) if is_there else inf
             if mission["state"] == "done" or (is_aside and now - near_since > DWELL):
                 return ""
             if mission["state"] in ENDED:

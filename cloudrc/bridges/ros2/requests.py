@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from math import cos, degrees, dist, hypot, inf, isfinite, sin
+from math import cos, degrees, dist, hypot, inf, isfinite, pi, radians, remainder, sin
 
 from cloudrc.bridges.ros2.description import RobotFrames
 from cloudrc.config.heading import WHY, Heading
+from cloudrc.config.schema import YAW_TOLERANCE_DEG
 from cloudrc.console.steering import Steering
 from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import ZERO, Quaternion, Vector
@@ -64,6 +65,7 @@ class RosRequests:
         self.yaw = 0.0
         self.refusal: tuple[str, ...] = ()
         self._goal: Vector = ZERO
+        self._goal_yaw: float | None = None  # [rad]; None: any
         # Velocity, end of its time [s], yaw rate [rad/s].
         self._wanted: tuple[Vector, float, float | None] | None = None
         self._passed = -inf  # time at which the newest velocity was passed on [s]
@@ -85,14 +87,20 @@ class RosRequests:
         Return why it does not; "" if it does.
         """
         x, y, z = position
+        yaw_deg = None
         why = self._refuse("goal_pose", frame, self._frames.ground, (*position, *wxyz))
+        if not why:
+            yaw_deg = _yaw_deg(wxyz)
+            if self._heading == "fixed" and abs(yaw_deg or 0.0) > YAW_TOLERANCE_DEG:
+                why = f"yaw {yaw_deg:.0f} degrees: {WHY['fixed']}; give the goal the yaw 0"
+                self._tell(f"goal_pose: {why}")
         if not why:
             if z == 0.0:  # RViz clicks on the ground
                 z = max(self.position[2], HEIGHT)
             self._goal = (x, y, self.position[2] if self._planar else z)
             place = (x, y) if self._planar else self._goal
-            turns = self._heading == "free"
-            answer = self._steering.go_to(place, _yaw_deg(wxyz) if turns else None)
+            self._goal_yaw = None if yaw_deg is None else radians(yaw_deg)
+            answer = self._steering.go_to(place, None if self._heading == "fixed" else yaw_deg)
             self._tell(answer.text)
             why = answer.text if answer.is_refusal else ""
         if why:
@@ -107,6 +115,13 @@ class RosRequests:
     def distance(self) -> float:
         """Distance to the newest goal [m]."""
         return dist(self.position, self._goal)
+
+    @property
+    def has_heading(self) -> bool:
+        """Whether the robot has the heading of the newest goal, if that has one."""
+        if self._goal_yaw is None:
+            return True
+        return abs(remainder(self._goal_yaw - self.yaw, 2 * pi)) <= radians(YAW_TOLERANCE_DEG)
 
     def drive(self, frame: str, linear: Sequence[float], yaw_rate: float) -> None:
         """Drive with a velocity in `frame`; an empty frame is that of the base.

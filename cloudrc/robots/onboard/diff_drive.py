@@ -21,6 +21,9 @@ from cloudrc.sim.wheels import Wheel, read_wheels
 SLOW = 0.1
 """Below this wanted speed the robot turns towards it more slowly, in proportion, because the
 direction of a speed near zero is noise [m/s]."""
+NEAR_REST = 0.05
+"""Below this wanted speed a commanded yaw rate alone turns the robot: towards the last centimetres
+to a goal it would turn away from the heading that it has to have there [m/s]."""
 KEEP_END = 0.2
 """The end that leads changes when the velocity points beyond the side of the robot by an angle with
 this sine. Without this margin, a velocity to the side would make the robot turn to and fro."""
@@ -68,6 +71,8 @@ class DiffDrive:
         if self._lead * ahead < -KEEP_END * speed:
             self._lead = -self._lead
         share = min(speed / SLOW, 1.0)
+        if yaw_rate and speed < NEAR_REST:
+            share = 0.0
         angle = atan2(self._lead * left, self._lead * ahead)
         turn = share * self._turn_gain * angle + (1.0 - share) * yaw_rate
         return self._wheel_speeds(ahead, turn)
