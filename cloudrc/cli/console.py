@@ -15,6 +15,7 @@ from cloudrc.cli.where import (
     given_token,
     need_run_here,
     release_arguments,
+    run_argument,
 )
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 from cloudrc.teleop.client import Api
@@ -41,7 +42,8 @@ def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     add = flags(parser)
     about = "folder of the flying run (default: the only run in flight), or a release"
-    add("run", "RUN|RELEASE", about, nargs="?")
+    add("target", "RUN|RELEASE", about, nargs="?")
+    run_argument(parser)
     port = "port of the page on 127.0.0.1 (default: any free port)"
     add("--port", "N", port, 0, whole_number(0, 65_535))
     about = "show the page of a release, and carry out its changes of the link until Ctrl-C"
@@ -68,7 +70,8 @@ def _origin(text: str) -> str:
 
 def execute(options: Options) -> int:
     """Serve the page until the flight ends or the user interrupts."""
-    run: Path | None = options.run
+    run: Path | None = options.target
+    options.run = options.run or run
     if run and len(run.parts) == 1 and not (run.exists() or options.release):
         tell(f"no folder '{run}' here: looking for a release")
         options.run, options.release = None, str(run)

@@ -19,6 +19,7 @@ VERBS = {"bridge": "publish a flight on ROS 2, and take goals and velocities fro
 EPILOG = """\
 examples:
   cloudrc ros bridge                     beside 'cloudrc up' in another terminal
+  cloudrc ros bridge --run ../runs/latest     a flight of another folder
   cloudrc ros bridge --namespace drone1  /drone1/odom and so on
   cloudrc ros bridge --observe           nodes see the robot, but cannot steer
 
@@ -34,7 +35,8 @@ def arguments(parser: Parser) -> None:
     bridge = add_verbs(parser, VERBS)["bridge"]
     bridge.epilog = EPILOG
     add = flags(bridge)
-    add("run", "RUN", "folder of the flying run (default: the only run in flight)", nargs="?")
+    about = "folder of the flying run (default: the only one in flight in this folder)"
+    add("--run", "DIR", about)
     about = "namespace of topics and services, and prefix of the robot's frames (default: none)"
     add("--namespace", "NAME", about, "", ros_namespace)
     add("--observe", "", "let nodes see the robot, but not steer it")
@@ -77,7 +79,7 @@ def execute(options: Options) -> None:
 def _local(options: Options) -> _Flight:
     from cloudrc.drivers.local import under_way
 
-    found = need_run_here(options.run, steers=not options.observe)
+    found = need_run_here(options.run, steers=not options.observe, elsewhere=False)
     run, socket = found.folder.resolve(), Path(found.url.removeprefix("unix:"))
 
     def has_ended() -> bool:
@@ -88,7 +90,7 @@ def _local(options: Options) -> _Flight:
 
 def _in_pod(options: Options) -> _Flight:
     if options.run or not (options.config and options.records and options.api):
-        text = "are for the chart's container: give all of them, and no RUN"
+        text = "are for the chart's container: give all of them, and no --run"
         raise BadInputError(f"--config, --records and --api {text}")
     token = given_token(options)
     api = Api(options.api, token or str)

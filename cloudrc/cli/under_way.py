@@ -27,7 +27,9 @@ def short(path: Path) -> str:
     return str(path.relative_to(here) if is_inside else path)
 
 
-def find_run(run: Path | None, *, steers: bool = True, links: bool = False) -> RunInFlight | None:
+def find_run(
+    run: Path | None, *, steers: bool = True, links: bool = False, elsewhere: bool = True
+) -> RunInFlight | None:
     """Find the run in flight that a user means: `run`, else the only one; tell if it is another's.
 
     If the user's newest run here, ./runs/latest, has ended, a command that changes a flight rejects
@@ -37,13 +39,14 @@ def find_run(run: Path | None, *, steers: bool = True, links: bool = False) -> R
         run: Folder of the run; None if the user names none.
         steers: Whether the command changes the flight.
         links: Whether the command can also use a link of `link exec` or `relay tcp`.
+        elsewhere: Whether to take a run outside of the working folder that the user has not named.
 
     Returns:
         The run; None if no run is in flight.
 
     Raises:
-        BadInputError: If `run` is not in flight; if several runs are in flight; or if the command
-            changes a flight and ./runs/latest has ended.
+        BadInputError: If `run` is not in flight; if several runs are in flight; if the command
+            changes a flight and ./runs/latest has ended; or if all runs are `elsewhere`.
     """
     # The URL comes from this user's flight files, never from the run's folder: a run's folder may
     # come from somebody else and name a foreign server.
@@ -53,6 +56,12 @@ def find_run(run: Path | None, *, steers: bool = True, links: bool = False) -> R
         if url is None:
             raise BadInputError(f"{run}: no run flies there; name another folder")
         return RunInFlight(run, url)
+    if not elsewhere and flights:
+        inside = {run: flights[run] for run in flights if run.is_relative_to(Path.cwd())}
+        if not inside:
+            text = "no run flies in this folder; if you mean another one, name it"
+            raise BadInputError(f"{text}: {_flags(flights)}")
+        flights = inside
     without_flight = bool(flights) and flights.keys().isdisjoint(under_way())
     ask_if_unclear(flights, steers=steers and not without_flight)
     return next((RunInFlight(Path(short(run)), url) for run, url in flights.items()), None)
@@ -87,11 +96,18 @@ def ask_if_unclear(candidates: Collection[Path], *, steers: bool) -> None:
     latest = Path(os.path.realpath(RUNS / "latest"))
     names = " or ".join(short(run) for run in sorted(candidates))
     if len(candidates) > 1:
-        raise BadInputError(f"{len(candidates)} runs are flying here; name one: {names}")
+        raise BadInputError(
+            f"{len(candidates)} runs are flying here; name one: {_flags(candidates)}"
+        )
     is_mine = latest in candidates
     if steers and not is_mine and (latest / LINK_LOG).exists():  # this user steered that flight
-        others = names or "--release NAME (in a cluster)"
+        others = _flags(candidates) or "--release NAME (in a cluster)"
         text = f"has ended, or does not take this command; name another flight: {others}"
         raise BadInputError(f"{short(latest)}: {text}; or start one: cloudrc up")
     if candidates and not is_mine:
         tell(f"using the run in {names}")
+
+
+def _flags(runs: Collection[Path]) -> str:
+    """Return the flags that name runs, such as "--run a or --run b"."""
+    return " or ".join(f"--run {short(run)}" for run in sorted(runs))

@@ -105,11 +105,11 @@ def find_local_run(
     return find_run(options.run, steers=steers, links=links)
 
 
-def need_run_here(run: Path | None, *, steers: bool = True) -> RunInFlight:
+def need_run_here(run: Path | None, *, steers: bool = True, elsewhere: bool = True) -> RunInFlight:
     """Find a run as `cli.under_way.find_run` does; raise a BadInputError if none flies."""
     from cloudrc.cli.under_way import find_run
 
-    if (found := find_run(run, steers=steers)) is None:
+    if (found := find_run(run, steers=steers, elsewhere=elsewhere)) is None:
         raise BadInputError("no run flies here; start one: cloudrc up")
     return found
 

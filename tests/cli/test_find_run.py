@@ -8,7 +8,9 @@ import threading
 
 import pytest
 
+from cloudrc.cli.where import need_run_here
 from cloudrc.drivers import local
+from cloudrc.errors import BadInputError
 from cloudrc.teleop.client import Api
 from tests.conftest import wait_until
 from tests.teleop.conftest import FAR, running
@@ -46,13 +48,26 @@ def test_the_only_run_is_used_and_of_several_one_is_named(tmp_path, elsewhere, s
         assert said(0, "mission estop") == f"cloudrc: using the run in {tmp_path / 'a'}\n"
         with flying(elsewhere / "runs" / "latest") as here:
             error = said(2, "mission estop")
-            assert f"name one: {tmp_path / 'a'} or runs/latest" in error
+            assert f"name one: --run {tmp_path / 'a'} or --run runs/latest" in error
             assert (len(a.alarms), len(here.alarms)) == (1, 0)
             assert said(0, "mission estop --run", tmp_path / "a") == ""
     with flying(elsewhere / "runs" / "one"):
         (elsewhere / "runs" / "latest").rmdir()
         (elsewhere / "runs" / "latest").symlink_to("one")
         assert said(0, "mission estop") == ""
+
+
+def test_the_bridge_never_takes_a_flight_of_another_folder_unless_it_is_named(tmp_path, elsewhere):
+    def found(run=None):
+        return need_run_here(run, elsewhere=False).folder.resolve()
+
+    other, here = tmp_path / "a", elsewhere / "runs" / "one"
+    with flying(other):
+        with pytest.raises(BadInputError, match=f"name it: --run {other}$"):
+            found()
+        assert found(other) == other
+        with flying(here):
+            assert found() == here
 
 
 def test_no_command_steers_another_flight_after_yours_has_ended(tmp_path, elsewhere, said):
@@ -65,7 +80,7 @@ def test_no_command_steers_another_flight_after_yours_has_ended(tmp_path, elsewh
     assert "no cluster is configured" in said(3, "mission hold --release other")
     with flying(tmp_path / "a") as api:
         using = f"cloudrc: using the run in {tmp_path / 'a'}\n"
-        assert f"name another flight: {tmp_path}/a; " in said(2, "mission estop")
+        assert f"name another flight: --run {tmp_path}/a; " in said(2, "mission estop")
         assert api.alarms == []
         assert said(0, "mission list") == using
         (latest / "uplink.log").unlink()  # as after a run in virtual time, which nobody steers

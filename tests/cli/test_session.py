@@ -48,7 +48,7 @@ def test_down_ends_sessions_only_and_asks_which(folder, down):
     (folder / "runs/latest/uplink.log").touch()
     with local.announced(folder / "theirs", "", "session"):
         with local.announced(folder / "b", "", "session"):
-            assert "2 runs are flying here; name one: b or theirs" in down(2)
+            assert "2 runs are flying here; name one: --run b or --run theirs" in down(2)
         assert "runs/latest: has ended, or does not take this command; name" in down(2)
         assert "theirs: ended" in down(0, "--run theirs")
 
