@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 from cloudrc.cli.output import print_lines, tell
@@ -32,6 +33,9 @@ exit codes: that of the client, or of the server if it fails first; 2 bad input,
 3 missing prerequisite, 4 the server does not listen in time, 6 the server ended
 with 0 before it listened, or the relay failed, 130 interrupted"""
 
+HIDING = "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST", "ROS_LOCALHOST_ONLY=1"
+"""Settings with which a node of ROS 2 finds those on its own machine only."""
+
 
 def arguments(parser: Parser) -> None:
     """Declare the action's arguments."""
@@ -49,17 +53,26 @@ def arguments(parser: Parser) -> None:
     add("-o --output", "FOLDER", output)
 
 
+def _warn_of_hidden_nodes(*commands: str) -> None:
+    """Warn if a setting lets nodes of ROS 2 find no node at the other end."""
+    for setting in HIDING:
+        name, _, value = setting.partition("=")
+        if os.environ.get(name) == value or any(setting in command for command in commands):
+            tell(f"warning: {setting}: nodes of ROS 2 at the two ends do not find each other")
+
+
 def execute(options: Options) -> int:
     """Run both programs, print the verdict on the link, and return the client's exit code."""
     from cloudrc.runs.links.programs import ExecSettings, run_programs
     from cloudrc.runs.links.programs_report import make_exec_report, write_report
-    from cloudrc.runs.links.verify import as_text
+    from cloudrc.runs.links.verify import OF_PROGRAMS, as_text
 
+    _warn_of_hidden_nodes(options.server, options.client)
     settings = settings_from(options, ExecSettings)
     outcome, link = run_programs(settings, tell)
     if link.engine is not None:
         report = make_exec_report(settings, outcome, link)
-        print_lines(["", *as_text(report).splitlines()], sys.stderr)
+        print_lines(["", *as_text(report, more=OF_PROGRAMS).splitlines()], sys.stderr)
         if settings.output:
             write_report(settings.output, report, link)
             tell(f"{settings.output}: link.json, uplink.csv, downlink.csv")

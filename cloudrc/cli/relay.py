@@ -94,10 +94,10 @@ def execute(options: Options) -> None:
         text = _as_text(report)
     else:
         from cloudrc.runs.links.topics import TopicSettings, relay_topic
-        from cloudrc.runs.links.verify import as_text
+        from cloudrc.runs.links.verify import OF_PROGRAMS, as_text
 
         report = relay_topic(settings_from(options, TopicSettings), tell)
-        text = as_text(report)
+        text = as_text(report, more=OF_PROGRAMS)
     print_result(options.output, report, text)
 
 

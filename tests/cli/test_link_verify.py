@@ -96,7 +96,9 @@ def test_a_fault_names_its_direction(release):
 
 def test_a_verdict_off_for_a_moment_does_not_end_the_wait(release, monkeypatch):
     release.hears(world="ok", cloud="open")
-    assert as_text(release.ask(0.0)).endswith("(--seconds) for mean of the uplink")
+    undecided = release.ask(0.0)
+    assert as_text(undecided).endswith("(--seconds) for mean of the uplink")
+    assert as_text(undecided, more="send more").endswith("(send more) for mean of the uplink")
     release.hears(world="off", cloud="open")
     later = iter([{}, {}, {"stamp_ns": 6, "world": "ok"}, {}, {"stamp_ns": 6, "cloud": "ok"}])
     clock = SimpleNamespace(monotonic=time.monotonic, sleep=lambda _: release.hears(**next(later)))

@@ -50,13 +50,15 @@ POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0  # between requests to a release; limit of 
 PORTS = METRICS["world"]["world"], METRICS["world"]["link"]
 NOT_JUDGED = "NOT JUDGED"  # in a note about a quantity that could not be verified
 KEYS = ("asked", "measured", "low", "high")
+OF_PROGRAMS = "send more, or run longer"
+"""How the link of a user's programs gets more packets."""
 COLUMNS = ("asked", "applied", "measured")
 """Values of a row in columns of their own; "applied" is what a relay has computed."""
 VERDICTS = {"off": "not believed", "open": "undecided", "ok": "believed"}
 """Worst verdict on any quantity of the link -> verdict on the whole link."""
 MEANINGS = {
     "not believed": ("red", "does not match its profile"),
-    "undecided": ("yellow", "needs more packets (--seconds)"),
+    "undecided": ("yellow", "needs more packets"),
     "believed": ("green", "matches its profile"),
 }
 """Verdict on a link -> its colour, and what it means."""
@@ -252,8 +254,11 @@ def _known(values: Mapping[str, Any]) -> dict[str, Any]:
     return {key: one for key, one in values.items() if one not in unknown and one == one}
 
 
-def as_text(report: Report, paint: Paint = plain) -> str:
-    """Format a report: a table per direction, notes, causes and, in the last line, the verdict."""
+def as_text(report: Report, paint: Paint = plain, more: str = "--seconds") -> str:
+    """Format a report: a table per direction, notes, causes and, in the last line, the verdict.
+
+    `more` says how the user gets more packets.
+    """
     lines = [escape(f"{report['link']}: {report['shaper']}")]
     for way, found in report["directions"].items():
         shown = [key for key in COLUMNS if any(key in row for row in found["rows"])]
@@ -268,7 +273,7 @@ def as_text(report: Report, paint: Paint = plain) -> str:
     if report["verdict"] == "undecided":
         judged = [(way, row) for way, one in report["directions"].items() for row in one["rows"]]
         names = [f"{row['name']} of the {way}" for way, row in judged if row["verdict"] == "open"]
-        text += f" for {', '.join(names)}" * bool(names)
+        text += f" ({more})" + f" for {', '.join(names)}" * bool(names)
     return "\n".join([*lines, paint(f"{report['verdict'].upper()}: the link {text}", colour)])
 
 
