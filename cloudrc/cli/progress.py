@@ -134,6 +134,7 @@ class FlightView(Progress):
         self._position: Vector = (math.nan, math.nan, math.nan)
         self._delay, self._waypoint = math.nan, -1
         self._guard, self._ended = GuardState.GROUND, False
+        self._logged = ""  # the newest line for a log
         super().__init__(on_stdout=events)
 
     def see(self, records: Iterable[Record]) -> None:
@@ -178,8 +179,15 @@ class FlightView(Progress):
         return line
 
     def log_line(self) -> str:
-        """Return the line for a log; a session may wait for its next mission for days."""
-        return super().log_line() if self._waypoints or self._step else ""
+        """Return the line for a log; "" if it is the line before, as while the flight waits.
+
+        A session may wait for its next mission for days.
+        """
+        line = super().log_line() if self._waypoints or self._step else ""
+        if line == self._logged:
+            return ""
+        self._logged = line
+        return line
 
     def _leg(self) -> str:
         number = self._waypoint + 1

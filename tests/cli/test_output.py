@@ -96,6 +96,14 @@ def test_a_flight_shows_what_happens_before_it_and_after_it(kind, monkeypatch):
         wait_until(lambda: "writes [it] (0 s)" in stderr.getvalue(), 5.0)
 
 
+def test_a_flight_that_waits_logs_its_status_once():
+    with redirect_stderr(io.StringIO()), FlightView(7) as view:
+        view.log_line()
+        assert view.log_line() == ""
+        view.see([GuardChange(0, GuardState.TRACK, "fresh commands")])
+        assert "TRACK" in view.log_line()
+
+
 PRINTS = """\
 import os, subprocess
 os.write(1, b"descriptor\\n")
