@@ -15,8 +15,9 @@ from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.output import format_document, output_argument, print_line, print_result, tell
-from cloudrc.cli.parser import Options, Parser, add_verbs, flags, read_count
+from cloudrc.cli.parser import Options, Parser, add_verbs, flags, read_count, read_size
 from cloudrc.errors import BadInputError
+from cloudrc.exercise.watch import LIMITS, Limits
 from cloudrc.outside.paths import check_there
 
 if TYPE_CHECKING:
@@ -47,6 +48,10 @@ def arguments(parser: Parser) -> None:
     about = "the task (default: task.yaml in DIR, or else the exercise)"
     add("--task", "TASK", about, None, Path)
     add("--jobs", "N", "hand-ins at once (default: one per usable core)", JOBS_MAX, read_count)
+    about = "memory of a part and its children together (default: 2Gi)"
+    add("--memory", "SIZE", about, LIMITS.memory, read_size)
+    about = f"processes of a part at once (default: {LIMITS.processes})"
+    add("--processes", "N", about, LIMITS.processes, read_count)
     output_argument(check, "output format, csv for several DIR", forms=("gradescope", "csv"))
 
 
@@ -99,6 +104,10 @@ def _read(source: Path) -> Task:
     return task
 
 
+def _limits(options: Options) -> Limits:
+    return Limits(memory=int(options.memory), processes=options.processes)
+
+
 def _check(options: Options, folder: Path) -> None:
     """Score a hand-in, and show each test as it ends."""
     from cloudrc.cli.progress import Progress
@@ -113,7 +122,7 @@ def _check(options: Options, folder: Path) -> None:
     rows = []
     with Progress(f"scores {folder}") as view:
         view.say(f"scores {folder}")
-        for row in check(folder.resolve(), source.resolve()):
+        for row in check(folder.resolve(), source.resolve(), _limits(options)):
             rows.append(row)
             view.say(f"  {row['part']}, {row['test']}: {row['points']:g}/{row['max_points']}")
     result = score.sum_up(rows)
@@ -137,7 +146,9 @@ def _check_all(options: Options, folders: Sequence[Path]) -> None:
     work = list(dict.fromkeys(folder.resolve() for folder in folders))
     with Progress(f"scores {len(work)} hand-ins") as view:
         for name, result in zip(
-            _names_of(work), map_in_order(partial(score, task), work, options.jobs), strict=True
+            _names_of(work),
+            map_in_order(partial(score, task, limits=_limits(options)), work, options.jobs),
+            strict=True,
         ):
             results[name] = result
             view.say(f"{name}: {result['score']:g}/{result['max_score']:g}")

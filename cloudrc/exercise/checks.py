@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -96,12 +98,12 @@ FORMULAS: dict[FormulaName, Callable[[Callable[..., Any]], Any]] = {
 """Name of a test -> function that returns the results of the plug-in that is built."""
 
 
-def compare(formula: FormulaName, part: str, file: Path) -> tuple[float, str]:
+def compare(formula: FormulaName, part: str, name: str) -> tuple[float, str]:
     """Return 1.0 and "right" if the student's results agree with those of a correct plug-in.
 
-    Otherwise raise an InvalidValueError. `file` is that of the `part`.
+    Otherwise raise an InvalidValueError. `name` is the plug-in's: the file of the `part`.
     """
-    builds = [partial(plugins.load, f"{part}s", name) for name in (str(file), REFERENCES[part])]
+    builds = [partial(plugins.load, f"{part}s", name) for name in (name, REFERENCES[part])]
     seen, wanted = (np.asarray(FORMULAS[formula](build), dtype=float) for build in builds)
     if seen.shape == wanted.shape:
         wrong = ~np.isclose(seen, wanted, rtol=0.0, atol=TOLERANCE)
@@ -182,38 +184,58 @@ def fly(test: TestConfig, own: Mapping[str, Path], beside: Path) -> tuple[float,
     return share, seen
 
 
-def run(task: Task, part: str, folder: Path, beside: Path) -> Iterator[dict[str, Any]]:
+def run(
+    task: Task, part: str, folder: Path | None, beside: Path, memory: str = "memory ran out"
+) -> Iterator[dict[str, Any]]:
     """Score the tests of a part of a task; yield a row per test, as it ends.
 
-    A test that cannot be scored gives 0. Files of experiments are in the folder `beside`.
+    A test that cannot be scored gives 0. Files of experiments are in the folder `beside`. Without
+    a `folder`, score cloudrc's own parts. `memory` is what a lack of memory is called.
     """
     files = task.files
     parts = (part,) if part in files else tuple(files)
-    own = {task.key(each): folder / files[each] for each in parts}
+    own = {task.key(each): folder / files[each] for each in parts} if folder else {}
     for test in task.parts[part].tests.values():
         try:
             if test.formula:
-                share, seen = compare(test.formula, part, folder / files[part])
+                name = str(folder / files[part]) if folder else REFERENCES[part]
+                share, seen = compare(test.formula, part, name)
             else:
                 share, seen = fly(test, own, beside)
         except code.FAILURES as error:
-            share, seen = 0.0, _explain(error, folder, files[parts[0]])
+            share, seen = 0.0, _explain(error, folder or beside, files[parts[0]], memory)
         yield {"points": test.points * share, "seen": seen}
 
 
-def _explain(error: BaseException, folder: Path, file: str) -> str:
+def place_of_frame(frame: FrameType, folder: Path) -> str:
+    """Return FILE:LINE of the line of the student's files that runs, or has just failed; or ""."""
+    trace, error = list[traceback.FrameSummary](), sys.exc_info()[1]
+    while error is not None:
+        trace += traceback.extract_tb(error.__traceback__)
+        error = error.__cause__
+    trace += traceback.extract_stack(frame)
+    return _place([(each.filename, each.lineno) for each in trace], folder)
+
+
+def _place(places: Sequence[tuple[str, int | None]], folder: Path) -> str:
+    inside = [place for place in places if place[0].startswith(f"{folder}{os.sep}")]
+    return f"{Path(inside[-1][0]).relative_to(folder)}:{inside[-1][1]}" if inside else ""
+
+
+def _explain(error: BaseException, folder: Path, file: str, memory: str) -> str:
     """Describe an error; begin with FILE:LINE, the place in the student's files that failed."""
     while isinstance(error, CloudrcError) and error.__cause__ is not None:
         error = error.__cause__
     told = isinstance(error, CloudrcError | InvalidValueError)
     text = str(error) if told else describe_error(error)
+    if isinstance(error, MemoryError):
+        text = memory
     trace = traceback.extract_tb(error.__traceback__)
     places = [(each.filename, each.lineno) for each in trace]
     if isinstance(error, SyntaxError):
         places.append((str(error.filename), error.lineno))
-    places = [place for place in places if place[0].startswith(f"{folder}{os.sep}")]
-    if places:
-        text = f"{places[-1][0]}:{places[-1][1]}: {text}"
+    if place := _place(places, folder):
+        text = f"{place}: {text}"
     elif not isinstance(error, PlacedError):
         text = f"{file}: {text}"
     return text.replace(f"{folder}{os.sep}", "")

@@ -12,50 +12,63 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
+from typing import Any, NamedTuple
 
 from cloudrc.config.task import read_task
-from cloudrc.drivers.machine import interpreter, signal_group
-from cloudrc.errors import to_one_line
+from cloudrc.drivers.machine import await_or_kill, interpreter, signal_group
+from cloudrc.errors import TEXT_MAX, to_one_line
 from cloudrc.exercise import hand_in
 from cloudrc.exercise.files import SHIPPED, describe_missing, task_of
 from cloudrc.exercise.score import sum_up
+from cloudrc.exercise.watch import LIMITS, Limits
 
-TIME_LIMIT = 60
-"""Limit of each part [s] of processor time; the solution needs 5 s."""
-PATIENCE = 10
-"""Last resort: each part ends after the limit times this number, in real time [1]."""
+ENDING = 10.0
+"""Longest time in which a part and its children end [s]."""
 ROWS_MAX = 64 << 10
 """Largest size of all rows of a part [bytes]."""
 
 
-def run_part(
-    part: str, folder: Path, limit: int, wait: float, source: Path = SHIPPED
-) -> tuple[bytes, str]:
-    """Score a part in a process; return what it has written, and why it writes no more.
+class Outcome(NamedTuple):
+    """What a part's process left."""
 
-    The process has a session of its own, which ends with it. It has `limit` [s] of processor time,
-    and ends after `wait` [s].
+    rows: bytes
+    """What it has written"""
+    place: str
+    """FILE:LINE of the student's files where it broke a limit, if Python could say it"""
+    why: str
+    """Why it wrote no more rows; "" if it took too long in real time"""
+
+
+def run_part(
+    part: str, folder: Path | None, source: Path = SHIPPED, limits: Limits = LIMITS
+) -> Outcome:
+    """Score a part in a process, which ends with all its children.
+
+    `folder` is None for cloudrc's own parts.
     """
     why = "ended the process of the check, or sent something else than its results"
-    with TemporaryFile() as rows:
+    words = (part, str(folder or ""), str(source), json.dumps(limits))
+    with TemporaryFile() as rows, TemporaryFile() as notes:
         process = subprocess.Popen(
-            interpreter("-m", hand_in.__name__, part, str(folder), str(limit), str(source)),
+            interpreter("-m", hand_in.__name__, *words),
             start_new_session=True,
             stdin=subprocess.PIPE,
             stdout=rows,
-            stderr=subprocess.DEVNULL,
+            stderr=notes,
         )
         try:
-            if process.wait(wait) == -signal.SIGXCPU:
-                why = f"no end after {limit} s of processor time"
+            process.wait(limits.seconds * limits.patience)
         except subprocess.TimeoutExpired:
             why = ""
         finally:
-            signal_group(process, signal.SIGKILL)  # nothing of a hand-in runs on
-            process.communicate()
-        rows.seek(0)
-        return rows.read(ROWS_MAX), why
+            assert process.stdin is not None
+            process.stdin.close()  # nothing of a hand-in runs on
+            await_or_kill(process, ENDING)
+            signal_group(process, signal.SIGKILL)
+        for file in (rows, notes):
+            file.seek(0)
+        place, _, limit = notes.read(TEXT_MAX).decode(errors="replace").partition("\n")
+        return Outcome(rows.read(ROWS_MAX), place, why and (limit or why))
 
 
 def read_rows(data: bytes) -> list[tuple[float, str]]:
@@ -71,32 +84,34 @@ def read_rows(data: bytes) -> list[tuple[float, str]]:
 
 
 def check(
-    folder: Path, source: Path = SHIPPED, limit: int = TIME_LIMIT, patience: float = PATIENCE
+    folder: Path | None, source: Path = SHIPPED, limits: Limits = LIMITS
 ) -> Iterator[dict[str, Any]]:
-    """Score the student's files in a folder, each part within `limit` [s] of processor time.
+    """Score the student's files in a folder, each part within `limits`; None: cloudrc's own parts.
 
     `source` is the task. Yield one dictionary per test, when its part has ended: the test's name,
     its points, the result in words, and whether the points are valid. They are not if a part took
-    `patience` times the limit in real time.
+    too long in real time.
     """
-    wait, task = limit * patience, read_task(source)
-    for part, about in task.parts.items():
-        data, why = run_part(part, folder, limit, wait, source)
-        slow = f"too slow here: no end after {wait:g} s; the score is not valid"
-        hint = describe_missing(folder, [about.file] if about.file else [])
-        rows = iter(read_rows(data))
+    slow = f"too slow here: no end after {limits.seconds * limits.patience:g} s"
+    for part, about in read_task(source).parts.items():
+        ran = run_part(part, folder, source, limits)
+        missing = describe_missing(folder, [about.file]) if folder and about.file else ""
+        why = (
+            f"{ran.place or about.file or 'a file'}: {ran.why or f'{slow}; the score is not valid'}"
+        )
+        rows = iter(read_rows(ran.rows))
         for test, asked in about.tests.items():
-            points, seen = next(rows, (0.0, f"{about.file or 'a file'}: {why or slow}"))
+            points, seen = next(rows, (0.0, why))
             yield {
                 "part": part,
                 "test": test,
                 "points": round(min(points, asked.points), 1) if points > 0.0 else 0.0,
                 "max_points": asked.points,
-                "seen": to_one_line(f"{seen}; {hint}" if hint else seen),
-                "valid": bool(why),
+                "seen": to_one_line(missing or seen),
+                "valid": bool(ran.why),
             }
 
 
-def score(source: Path | None, folder: Path) -> dict[str, Any]:
+def score(source: Path | None, folder: Path, limits: Limits = LIMITS) -> dict[str, Any]:
     """Return the score of a hand-in; `source` is the task, None: that of its folder."""
-    return sum_up([*check(folder, task_of(folder, source))])
+    return sum_up([*check(folder, task_of(folder, source), limits)])

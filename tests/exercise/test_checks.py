@@ -18,6 +18,7 @@ from cloudrc.config.shipped import file_of
 from cloudrc.config.task import read_task
 from cloudrc.exercise import checks, scoring
 from cloudrc.exercise.files import SHIPPED
+from cloudrc.exercise.watch import Limits
 from tests.conftest import nightly, wait_until
 
 SOLUTION = Path(__file__).with_name("solution")
@@ -80,10 +81,10 @@ def test_whatever_a_file_does_the_other_parts_are_scored(tmp_path):
     (tmp_path / "delay_estimator.py").write_text("while True:\n    print('on and on')\n")
     (tmp_path / "predictor.py").write_text("import sys\nsys.exit('no')\n")
     (tmp_path / "controller.py").write_text("import os\nos._exit(0)\n")
-    rows = list(scoring.check(tmp_path, limit=4))
+    rows = list(scoring.check(tmp_path, limits=Limits(seconds=4)))
     seen = {row["part"]: row["seen"] for row in rows}
     assert [row["test"] for row in rows] == [*chain(*ALL.values())]
-    assert seen["estimator"] == "delay_estimator.py: no end after 4 s of processor time"
+    assert seen["estimator"] == "delay_estimator.py:2: no end after 4 s of processor time"
     assert seen["predictor"] == "predictor.py:2: SystemExit: no (sys.exit() was called)"
     assert seen["controller"].startswith("controller.py: ended the process of the check")
     assert {row["points"] for row in rows} == {0.0}
@@ -118,7 +119,7 @@ def test_forged_rows_cost_or_give_the_points_of_their_part_at_most(
     write = f"for n in range(3, 9):\n    try: os.write(n, {data!r})\n    except OSError: pass\n"
     (tmp_path / "predictor.py").write_text(f"import os\n{write}os._exit(0)\n")
     only(monkeypatch, "predictor")
-    rows = list(scoring.check(tmp_path, limit=20))
+    rows = list(scoring.check(tmp_path, limits=Limits(seconds=20)))
     assert [row["points"] for row in rows] == points
     json.dumps(rows, allow_nan=False).encode()
     assert all("\n" not in row["seen"] and len(row["seen"]) < 2500 for row in rows)
@@ -131,7 +132,7 @@ def test_a_wait_costs_no_processor_time_and_ends_with_a_score_that_is_not_valid(
     """A loaded computer gives a right hand-in too little processor time, which costs no points."""
     hand_in(tmp_path, "import time\ntime.sleep(60.0)")
     only(monkeypatch, "predictor")
-    first, *_ = scoring.check(tmp_path, limit=10, patience=0.1)
+    first, *_ = scoring.check(tmp_path, limits=Limits(seconds=10, patience=0.1))
     assert "too slow here" in first["seen"]
     assert not first["valid"]
 
@@ -141,8 +142,8 @@ def test_a_file_of_the_hand_in_is_found_by_its_name_from_everywhere(tmp_path, mo
     hand_in(tmp_path, "open('gains.json').close()")
     (tmp_path / "gains.json").touch()
     monkeypatch.chdir("/")
-    data, _ = scoring.run_part("predictor", tmp_path, 20, 200.0)
-    assert scoring.read_rows(data)[0] == (6.0, "right")
+    ran = scoring.run_part("predictor", tmp_path)
+    assert scoring.read_rows(ran.rows)[0] == (6.0, "right")
 
 
 CHILDREN = {
@@ -174,7 +175,7 @@ def leave(child, folder):
 @pytest.mark.parametrize("child", CHILDREN.values(), ids=CHILDREN)
 def test_no_child_of_a_file_outlives_the_check(child, tmp_path):
     marker = leave(child, tmp_path)
-    scoring.run_part("predictor", tmp_path, 20, 200.0)
+    scoring.run_part("predictor", tmp_path)
     wait_until(lambda: not is_running(marker), 5.0)
 
 
