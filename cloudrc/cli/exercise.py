@@ -9,16 +9,27 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from shlex import quote
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.output import format_document, output_argument, print_line, print_result, tell
+from cloudrc.cli.output import (
+    TABLE,
+    format_document,
+    output_argument,
+    print_line,
+    print_lines,
+    print_result,
+    tell,
+)
 from cloudrc.cli.parser import Options, Parser, add_verbs, flags, read_count, read_size
 from cloudrc.errors import BadInputError
 from cloudrc.exercise.watch import LIMITS, Limits
-from cloudrc.outside.paths import check_there
+from cloudrc.files import write_atomically
+from cloudrc.outside.paths import check_there, read_file
 
 if TYPE_CHECKING:
     from cloudrc.config.task import Task
@@ -30,6 +41,7 @@ examples:
   cloudrc class check exercise      the points of each part
   cloudrc class new TASK.yaml       a task of your own, see docs/exercise.md
   cloudrc class check hand-ins/* --task TASK.yaml > points.csv
+  cloudrc class check hand-ins/* --task TASK.yaml --resume points.csv
   cloudrc class check /autograder/submission -o gradescope > results.json
 
 'check' runs the files in DIR with all your rights; it is no sandbox."""
@@ -43,8 +55,8 @@ def arguments(parser: Parser) -> None:
         "task", "TASK", "file of your own task (.yaml), beside the files to fill in", nargs="?"
     )
     flags(new)("folder", "DIR", "folder for the files (default: named as TASK)")
-    check.add_argument("folders", metavar="DIR", nargs="+", type=Path, help="folder with the files")
     add = flags(check)
+    add("folders", "DIR", "hand-in: a folder or a zip", nargs="+")
     about = "the task (default: task.yaml in DIR, or else the exercise)"
     add("--task", "TASK", about, None, Path)
     add("--jobs", "N", "hand-ins at once (default: one per usable core)", JOBS_MAX, read_count)
@@ -52,24 +64,29 @@ def arguments(parser: Parser) -> None:
     add("--memory", "SIZE", about, LIMITS.memory, read_size)
     about = f"processes of a part at once (default: {LIMITS.processes})"
     add("--processes", "N", about, LIMITS.processes, read_count)
-    output_argument(check, "output format, csv for several DIR", forms=("gradescope", "csv"))
+    about = "table of an earlier call: score the hand-ins without a row, and add their rows"
+    add("--resume", "FILE", about)
+    output_argument(check, "output format, csv for several hand-ins", forms=("gradescope", "csv"))
 
 
 def execute(options: Options) -> None:
-    """Write a student's files, or score the files in folders; return 0 whatever the score."""
+    """Write a student's files, or score hand-ins; return 0 whatever the score."""
     if options.verb == "new":
         _new(options.task, options.folder)
         return
-    folders = [folder for folder in options.folders if folder.is_dir()]
-    for other in options.folders:
-        if other not in folders:
+    given = list[Path]()
+    for path in dict.fromkeys(path.resolve() for path in options.folders):
+        if path.is_dir() or (path.suffix == ".zip" and path.is_file()):
+            given.append(path)
+        else:
             if len(options.folders) == 1:
-                check_there(other, "'cloudrc class new' makes one")
-            tell(f"{other}: no folder; left out")
-    if len(options.folders) > 1 or options.output == "csv":
-        _check_all(options, folders)
-    elif folders:
-        _check(options, folders[0])
+                check_there(path, "'cloudrc class new' makes one")
+            tell(f"{path}: neither a folder nor a zip; left out")
+    with TemporaryDirectory() as scratch:
+        if len(options.folders) > 1 or options.output == "csv" or options.resume:
+            _check_all(options, given, Path(scratch))
+        elif given:
+            _check(options, given[0], Path(scratch))
 
 
 def _new(task: str | None, folder: Path) -> None:
@@ -87,8 +104,24 @@ def _new(task: str | None, folder: Path) -> None:
         if outside := [file for file in needed if not file.is_relative_to(beside)]:
             raise BadInputError(f"{source}: a flight needs {outside[0]}; put it beside the task")
     names = write_files(folder, source, needed)
+    if source != SHIPPED:
+        _show_points(folder.resolve(), source.resolve())
     command = f"cloudrc class check {quote(str(folder))}"
     print_line(f"fill in {', '.join(names)} in {folder}, then: {command}")
+
+
+def _show_points(folder: Path, source: Path) -> None:
+    """Print the points of the files as they are handed out, and of cloudrc's own parts."""
+    from cloudrc.cli.progress import Progress
+    from cloudrc.exercise.scoring import check
+    from cloudrc.text import table
+
+    cells = [("part", "test", "points", "files to fill in", "cloudrc's own")]
+    with Progress("scores the files to fill in, and cloudrc's own parts"):
+        for files, own in zip(check(folder, source), check(None, source), strict=True):
+            points = (f"{row['points']:g}" for row in (files, own))
+            cells.append((files["part"], files["test"], str(files["max_points"]), *points))
+    print_lines(table(cells, right=(2, 3, 4)).splitlines())
 
 
 def _read(source: Path) -> Task:
@@ -108,21 +141,23 @@ def _limits(options: Options) -> Limits:
     return Limits(memory=int(options.memory), processes=options.processes)
 
 
-def _check(options: Options, folder: Path) -> None:
+def _check(options: Options, given: Path, scratch: Path) -> None:
     """Score a hand-in, and show each test as it ends."""
     from cloudrc.cli.progress import Progress
     from cloudrc.exercise import score
-    from cloudrc.exercise.files import task_of
+    from cloudrc.exercise.files import open_hand_in
     from cloudrc.exercise.scoring import check
 
-    source = task_of(folder, options.task)
-    task = _read(source)
+    hand_in = open_hand_in(given, options.task, scratch / "0")
+    if hand_in.refused:
+        raise BadInputError(hand_in.refused)
+    task = _read(hand_in.source)
     if options.output != "gradescope":  # there, a hand-in without the files gets 0 points
-        _check_files(folder, [*task.files.values()])
+        _check_files(given, hand_in.folder, [*task.files.values()])
     rows = []
-    with Progress(f"scores {folder}") as view:
-        view.say(f"scores {folder}")
-        for row in check(folder.resolve(), source.resolve(), _limits(options)):
+    with Progress(f"scores {given}") as view:
+        view.say(f"scores {given}")
+        for row in check(hand_in.folder, hand_in.source, _limits(options)):
             rows.append(row)
             view.say(f"  {row['part']}, {row['test']}: {row['points']:g}/{row['max_points']}")
     result = score.sum_up(rows)
@@ -130,29 +165,78 @@ def _check(options: Options, folder: Path) -> None:
     print_result(options.output, result, score.as_text(result), **forms)
 
 
-def _check_all(options: Options, folders: Sequence[Path]) -> None:
-    """Score several hand-ins at once."""
+def _check_all(options: Options, given: Sequence[Path], scratch: Path) -> None:
+    """Score several hand-ins at once; write each row of the table as soon as it is there."""
     from cloudrc.cli.progress import Progress
-    from cloudrc.exercise.score import as_csv
+    from cloudrc.config.task import read_task
+    from cloudrc.exercise.files import open_hand_in
+    from cloudrc.exercise.score import as_row, columns
     from cloudrc.exercise.scoring import score
-    from cloudrc.trials.workers import map_in_order
+    from cloudrc.trials.workers import map_in_order, take_each
 
     if options.output == "gradescope":
         raise BadInputError("-o gradescope: give one DIR")
+    if options.resume and options.output not in (TABLE, "csv"):
+        raise BadInputError(f"--resume: its table is CSV; leave out -o {options.output}")
     task = options.task and options.task.resolve()
     if task:
         _read(task)
-    results = dict[str, Any]()
-    work = list(dict.fromkeys(folder.resolve() for folder in folders))
-    with Progress(f"scores {len(work)} hand-ins") as view:
-        for name, result in zip(
-            _names_of(work),
-            map_in_order(partial(score, task, limits=_limits(options)), work, options.jobs),
-            strict=True,
-        ):
-            results[name] = result
-            view.say(f"{name}: {result['score']:g}/{result['max_score']:g}")
-    print_result(options.output, {"hand_ins": results}, as_csv(results), csv=as_csv(results))
+    as_table = options.output in (TABLE, "csv")
+    hand_ins = [
+        open_hand_in(path, task, scratch / str(number))._replace(name=name)
+        for number, (path, name) in enumerate(zip(given, _names_of(given), strict=True))
+    ]
+    heads, results = columns(read_task(each.source) for each in hand_ins), dict[str, Any]()
+    with ExitStack() as stack:
+        table = _Table(options.resume, heads, stack) if as_table else None
+        left = [each for each in hand_ins if table is None or each.name not in table.known]
+        view = stack.enter_context(Progress(f"scores {len(left)} hand-ins"))
+
+        def take(found: tuple[str, dict[str, Any]]) -> None:
+            name, results[name] = found
+            if table:
+                table.write(as_row(*found, heads))
+            view.say(f"{name}: {results[name]['score']:g}/{results[name]['max_score']:g}")
+
+        work = partial(score, limits=_limits(options))
+        stopped = take_each(map_in_order(work, left, options.jobs, in_order=False), take)
+    if stopped:
+        file = options.resume or "the file that has these rows"
+        tell(f"{len(results)} of {len(left)} are scored; to continue, add --resume {file}")
+        raise stopped
+    if table is None:
+        print_result(options.output, {"hand_ins": results}, "")
+
+
+class _Table:
+    """The table of a class: on stdout, or a file that gets the rows which it lacks.
+
+    Attributes:
+        known: The hand-ins whose rows are there. Rows that are not valid or not whole are dropped.
+    """
+
+    def __init__(self, path: Path | None, heads: Sequence[str], stack: ExitStack) -> None:
+        """Write the head; `path` is the file, which may not exist yet, None: stdout."""
+        from cloudrc.exercise.score import csv_line, read_table
+
+        self._file, rows = None, list[list[str]]()
+        if path and path.exists():
+            data = read_file(path, f"--resume {path}", "name the table of an earlier call")
+            try:
+                rows = read_table(data.decode("utf-8-sig"), heads)
+            except ValueError as error:
+                raise BadInputError(f"--resume {path}: {error}; name another file") from None
+        self.known = {row[0] for row in rows}
+        lines = [csv_line(row) for row in (heads, *rows)]
+        if path:
+            write_atomically(path, "".join(f"{line}\n" for line in lines).encode())
+            self._file = stack.enter_context(path.open("a", encoding="utf-8"))
+        else:
+            print_lines(lines)
+
+    def write(self, line: str) -> None:
+        """Add a row, so that it stays whatever happens later."""
+        print_line(line, self._file)
 
 
 def _names_of(folders: Sequence[Path]) -> list[str]:
@@ -164,10 +248,10 @@ def _names_of(folders: Sequence[Path]) -> list[str]:
     return [str(folder.relative_to(shared)) for folder in folders]
 
 
-def _check_files(folder: Path, names: Sequence[str]) -> None:
+def _check_files(given: Path, folder: Path, names: Sequence[str]) -> None:
     """Check that a folder has files of a student."""
     from cloudrc.exercise.files import describe_missing
 
     if not any((folder / name).exists() for name in names):
         hint = describe_missing(folder, names) or "name the folder that 'cloudrc class new' made"
-        raise BadInputError(f"{folder}: has none of {', '.join(names)}; {hint}")
+        raise BadInputError(f"{given}: has none of {', '.join(names)}; {hint}")

@@ -98,6 +98,20 @@ FORMULAS: dict[FormulaName, Callable[[Callable[..., Any]], Any]] = {
 """Name of a test -> function that returns the results of the plug-in that is built."""
 
 
+ASKED: dict[FormulaName, str] = {
+    "mean": "horizons [s], before the first delay and after each",
+    "hold time": "horizons [s] if commands wait in world; use sample.loop_delay",
+    "position": "position [m]",
+    "orientation": "orientation (wxyz)",
+    "velocity, stamp": "velocity [m/s] or stamp [s] (the last number)",
+    "P": "velocity [m/s] with P alone",
+    "I": "size of the velocity [m/s] with I alone, or after reset()",
+    "D": "size of the velocity [m/s] with D alone, or after reset()",
+    "limit": "size of the velocity [m/s] at its limit",
+}
+"""Name of a test -> what it compares, for students."""
+
+
 def compare(formula: FormulaName, part: str, name: str) -> tuple[float, str]:
     """Return 1.0 and "right" if the student's results agree with those of a correct plug-in.
 
@@ -111,7 +125,8 @@ def compare(formula: FormulaName, part: str, name: str) -> tuple[float, str]:
             return 1.0, "right"
         first = int(np.argwhere(wrong)[0, 0]) if wrong.ndim > 1 else slice(None)
         seen, wanted = seen[first], wanted[first]
-    raise InvalidValueError(f"gives {seen.round(3).tolist()}, not {wanted.round(3).tolist()}")
+    yours, right = seen.round(3).tolist(), wanted.round(3).tolist()
+    raise InvalidValueError(f"wrong {ASKED[formula]}: yours {yours}, right {right}")
 
 
 def check_flights(task: Task, beside: Path) -> None:
@@ -177,10 +192,15 @@ def fly(test: TestConfig, own: Mapping[str, Path], beside: Path) -> tuple[float,
     value = test.none if known is None else known.value
     share = min(max((value - test.none) / (test.full - test.none), 0.0), 1.0)
     seen = f"{test.number} {value:.3g} (all points: {test.full:g}, none: {test.none:g})"
+    if share < 1.0:
+        seen = f"too {'large' if test.full < test.none else 'small'}: {seen}"
     if failures := found.verdict.failures:
         texts = {failure.code: failure.text for failure in failures}
         share *= 0.0 if "plugin_failed" in texts else FAILED
-        seen += f"; {texts.get('plugin_failed', failures[0].text)}"
+        why = texts.get("plugin_failed", failures[0].text)
+        for key, file in own.items():
+            why = why.replace(key, file.name)  # a student knows the file
+        seen = f"{why}; {seen}"
     return share, seen
 
 

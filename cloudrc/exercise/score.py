@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from io import StringIO
 from typing import Any
 
+from cloudrc.config.task import Task
 from cloudrc.text import table
+
+FIRST, REMARKS = ("hand_in", "score", "max_score", "valid"), "remarks"
+"""First columns of a class's table, and the last one."""
 
 NOT_VALID = (
     "not valid: a part took too long; check again with less load, or look for a file that waits"
@@ -44,22 +48,44 @@ def for_gradescope(result: Mapping[str, Any]) -> dict[str, Any]:
     return found if result["valid"] else {**found, "output": NOT_VALID}
 
 
-def as_csv(scores: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the scores of several hand-ins by their names: a line each, a column for each test.
+def columns(tasks: Iterable[Task]) -> list[str]:
+    """Return the columns of a class's table: one for each test of the tasks."""
+    tests = [
+        f"{name}: {test}"
+        for task in tasks
+        for name, part in task.parts.items()
+        for test in part.tests
+    ]
+    return [*FIRST, *dict.fromkeys(tests), REMARKS]
 
-    The column `remarks` says what tests without points found.
-    """
+
+def csv_line(cells: Iterable[object]) -> str:
+    """Return a line of a table in CSV, without its end."""
     out = StringIO()
-    names = {f"{row['part']}: {row['test']}": 0 for s in scores.values() for row in s["checks"]}
-    first = ("hand_in", "score", "max_score", "valid")
-    writer = csv.DictWriter(out, [*first, *names, "remarks"], lineterminator="\n")
-    writer.writeheader()
-    for hand_in, result in scores.items():
-        rows = {f"{row['part']}: {row['test']}": row for row in result["checks"]}
-        remarks = {f"{name}: {row['seen']}" for name, row in rows.items() if not row["points"]}
-        writer.writerow(
-            {name: row["points"] for name, row in rows.items()}
-            | {"hand_in": hand_in, "remarks": " | ".join(sorted(remarks))}
-            | {name: result[name] for name in first[1:]}
-        )
-    return out.getvalue().rstrip("\n")
+    csv.writer(out, lineterminator="").writerow(cells)
+    return out.getvalue()
+
+
+def as_row(name: str, result: Mapping[str, Any], heads: Sequence[str]) -> str:
+    """Return a hand-in's line of the table with the columns `heads`.
+
+    The column `remarks` says, once for each cause, what tests without points found.
+    """
+    cells: dict[str, Any] = {"hand_in": name} | {key: result[key] for key in FIRST[1:]}
+    causes = dict[str, list[str]]()
+    for row in result["checks"]:
+        test = f"{row['part']}: {row['test']}"
+        cells[test] = row["points"]
+        if not row["points"]:
+            causes.setdefault(row["seen"], []).append(test)
+    cells[REMARKS] = " | ".join(f"{seen} ({', '.join(on)})" for seen, on in causes.items())
+    return csv_line(cells.get(head, "") for head in heads)
+
+
+def read_table(text: str, heads: Sequence[str]) -> list[list[str]]:
+    """Return the whole and valid rows of a class's table; raise a ValueError for another table."""
+    first, *rows = [*csv.reader(StringIO(text))] or [[*heads]]
+    if first != [*heads]:
+        raise ValueError("it has other columns; it is the table of another task")
+    place = heads.index("valid")
+    return [row for row in rows if len(row) == len(heads) and row[place].lower() == "true"]

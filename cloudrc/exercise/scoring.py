@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 from cloudrc.config.task import read_task
 from cloudrc.drivers.machine import await_or_kill, interpreter, signal_group
 from cloudrc.errors import TEXT_MAX, to_one_line
-from cloudrc.exercise import hand_in
-from cloudrc.exercise.files import SHIPPED, describe_missing, task_of
+from cloudrc.exercise import hand_in as part_process
+from cloudrc.exercise.files import SHIPPED, HandIn, describe_missing
 from cloudrc.exercise.score import sum_up
 from cloudrc.exercise.watch import LIMITS, Limits
 
@@ -28,7 +28,7 @@ ROWS_MAX = 64 << 10
 """Largest size of all rows of a part [bytes]."""
 
 
-class Outcome(NamedTuple):
+class PartResult(NamedTuple):
     """What a part's process left."""
 
     rows: bytes
@@ -41,7 +41,7 @@ class Outcome(NamedTuple):
 
 def run_part(
     part: str, folder: Path | None, source: Path = SHIPPED, limits: Limits = LIMITS
-) -> Outcome:
+) -> PartResult:
     """Score a part in a process, which ends with all its children.
 
     `folder` is None for cloudrc's own parts.
@@ -50,7 +50,7 @@ def run_part(
     words = (part, str(folder or ""), str(source), json.dumps(limits))
     with TemporaryFile() as rows, TemporaryFile() as notes:
         process = subprocess.Popen(
-            interpreter("-m", hand_in.__name__, *words),
+            interpreter("-m", part_process.__name__, *words),
             start_new_session=True,
             stdin=subprocess.PIPE,
             stdout=rows,
@@ -68,7 +68,7 @@ def run_part(
         for file in (rows, notes):
             file.seek(0)
         place, _, limit = notes.read(TEXT_MAX).decode(errors="replace").partition("\n")
-        return Outcome(rows.read(ROWS_MAX), place, why and (limit or why))
+        return PartResult(rows.read(ROWS_MAX), place, why and (limit or why))
 
 
 def read_rows(data: bytes) -> list[tuple[float, str]]:
@@ -84,21 +84,23 @@ def read_rows(data: bytes) -> list[tuple[float, str]]:
 
 
 def check(
-    folder: Path | None, source: Path = SHIPPED, limits: Limits = LIMITS
+    folder: Path | None, source: Path = SHIPPED, limits: Limits = LIMITS, refused: str = ""
 ) -> Iterator[dict[str, Any]]:
     """Score the student's files in a folder, each part within `limits`; None: cloudrc's own parts.
 
     `source` is the task. Yield one dictionary per test, when its part has ended: the test's name,
     its points, the result in words, and whether the points are valid. They are not if a part took
-    too long in real time.
+    too long in real time. Without a file, or if the hand-in is `refused`, nothing runs.
     """
     slow = f"too slow here: no end after {limits.seconds * limits.patience:g} s"
-    for part, about in read_task(source).parts.items():
-        ran = run_part(part, folder, source, limits)
-        missing = describe_missing(folder, [about.file]) if folder and about.file else ""
-        why = (
-            f"{ran.place or about.file or 'a file'}: {ran.why or f'{slow}; the score is not valid'}"
-        )
+    task = read_task(source)
+    for part, about in task.parts.items():
+        names = [about.file] if about.file else [*task.files.values()]
+        why = refused or (describe_missing(folder, names) if folder else "")
+        ran = PartResult(b"", "", why) if why else run_part(part, folder, source, limits)
+        place = ran.place or about.file or "a file"
+        if not why:
+            why = f"{place}: {ran.why or f'{slow}; the score is not valid'}"
         rows = iter(read_rows(ran.rows))
         for test, asked in about.tests.items():
             points, seen = next(rows, (0.0, why))
@@ -107,11 +109,11 @@ def check(
                 "test": test,
                 "points": round(min(points, asked.points), 1) if points > 0.0 else 0.0,
                 "max_points": asked.points,
-                "seen": to_one_line(missing or seen),
+                "seen": to_one_line(seen),
                 "valid": bool(ran.why),
             }
 
 
-def score(source: Path | None, folder: Path, limits: Limits = LIMITS) -> dict[str, Any]:
-    """Return the score of a hand-in; `source` is the task, None: that of its folder."""
-    return sum_up([*check(folder, task_of(folder, source), limits)])
+def score(hand_in: HandIn, limits: Limits = LIMITS) -> tuple[str, dict[str, Any]]:
+    """Return name and score of a hand-in."""
+    return hand_in.name, sum_up([*check(hand_in.folder, hand_in.source, limits, hand_in.refused)])

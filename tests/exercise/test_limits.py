@@ -1,18 +1,16 @@
-"""Memory and processes of hand-ins: whatever they take, each row is there and no process is left."""
+"""Memory and processes of hand-ins: each row is there, whatever they take, and none is left."""
 
 import csv
 import os
 import shutil
 import subprocess
 import sys
-import tempfile
 import time
 import zipfile
 from pathlib import Path
 
 import pytest
 
-from cloudrc.exercise.watch import LIMITS
 from tests.exercise.test_checks import OWN, SOLUTION
 
 RIGHT = (SOLUTION / "predictor.py").read_text()
@@ -23,20 +21,20 @@ DEF = "def predict("
 HEADS = {
     "list": "x = [0] * 10**10",
     "allowed": "x = bytearray(10**9)",
-    "grows": "x = []\nwhile True: x.append(b'1' * 10**7)",
+    "z grows": "x = []\nwhile True: x.append(b'1' * 10**7)",
     "children": "import subprocess, sys, time\nfor _ in range(60):\n"
     f"    subprocess.Popen([sys.executable, '-S', '-c', \"{CHILD.format(SLEEP)}\"])\n"
     "time.sleep(60)",
     "fork": f"import os\nwhile os.fork(): pass\nos.execlp('sleep', 'sleep', '{SLEEP}')",
 }
-"""Name of a hand-in -> what stands before the right predictor."""
+"""Name of a hand-in -> what stands before the right predictor; those that grow are far apart."""
 SAID = {
     "list": "predictor.py:1: used more than 2 GiB",
     "allowed": "",
-    "grows": "predictor.py:2: used more than 2 GiB",
-    "children": "predictor.py:4: used more than 2 GiB",
+    "z grows": "predictor.py:2: used more than 2 GiB",
+    "children": "used more than 2 GiB",
     "fork": "predictor.py:2: started more than 64 processes",
-    "call": "predictor.py:", 
+    "call": "predictor.py:",
     "right": "",
 }
 ANOTHER = ["setpriv", "--reuid=65534", "--inh-caps=+dac_override", "--ambient-caps=+dac_override"]
@@ -56,7 +54,9 @@ def write_class(folder):
     line = after.index("\n") + 1
     popen = POPEN.format(SLEEP)
     (folder / "all" / "call").mkdir()
-    (folder / "all/call/predictor.py").write_text(before + name + after[:line] + popen + after[line:])
+    (folder / "all/call/predictor.py").write_text(
+        before + name + after[:line] + popen + after[line:]
+    )
 
 
 def memory_of_children(process):
@@ -88,6 +88,35 @@ def check(folder, command=()):
         return {row["hand_in"]: row for row in csv.DictReader(out)}, most
 
 
+NOTEBOOK = '{"cells": [], "metadata": {}, "nbformat": 4, "nbformat_minor": 5}'
+OTHERS = {
+    "predictor.ipynb": (NOTEBOOK, "nbconvert --to script predictor.ipynb --output predictor"),
+    "predictor.py": (NOTEBOOK, "predictor.py is a notebook"),
+    "predictor (1).py": (RIGHT, "there is 'predictor (1).py': rename it to predictor.py"),
+    "exercise/predictor.py": (RIGHT, ""),
+    "exercise.zip": (b"no zip", "exercise.zip: no zip that can be read"),
+    "notes.txt": ("nothing", "predictor.py is missing"),
+    "a.py": ("import helper", "predictor.py is missing"),
+}
+"""File of a hand-in -> its content, and what the table says."""
+
+
+def write_others(folder):
+    """Write hand-ins with other files, four of each, and two zips; return what each row says."""
+    said = {}
+    for n, (name, (content, says)) in enumerate([*OTHERS.items()] * 4):
+        path = folder / "all" / f"other {n}" / name
+        path.parent.mkdir(parents=True)
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        said[f"other {n}"] = says
+    for path in (folder / "all/anna.zip", folder / "all/bert/exercise.zip"):
+        path.parent.mkdir(exist_ok=True)
+        with zipfile.ZipFile(path, "w") as file:
+            file.writestr("exercise/predictor.py", RIGHT)
+            file.writestr("__MACOSX/exercise/._predictor.py", "x")
+    return {**said, "anna.zip": "", "bert": ""}
+
+
 def no_process_is_left():
     return subprocess.run(["pgrep", "-f", SLEEP], stdout=subprocess.DEVNULL).returncode == 1
 
@@ -107,10 +136,50 @@ def test_a_part_has_its_own_memory_and_processes_and_leaves_none(command, tmp_pa
             process.kill()
             process.wait()
     assert no_process_is_left()
-    for name, said in SAID.items():
+    judge(rows, SAID)
+    assert "started more than 64 processes" in rows["call"]["remarks"]
+
+
+def judge(rows, told):
+    """Check that each row is there, and what its remark says."""
+    assert {*rows} == {*told}
+    for name, said in told.items():
         seen = rows[name]["remarks"]
         assert said in seen, (name, seen)
         assert bool(seen) == bool(said), (name, seen)
         assert (float(rows[name]["score"]) > 0.0) == (not said)
-    assert "started more than 64 processes" in rows["call"]["remarks"]
-    assert {row["valid"] for row in rows.values()} == {"True"}
+        assert rows[name]["valid"] == "True"
+
+
+@pytest.mark.process
+@pytest.mark.skipif(sys.platform != "linux", reason="the limits hold on Linux alone")
+def test_of_a_class_of_forty_each_hand_in_gets_a_row_and_the_memory_stays_small(tmp_path):
+    write_class(tmp_path)
+    told = {**SAID, **write_others(tmp_path)}
+    for n in range(40 - len(told)):
+        shutil.copytree(tmp_path / "all/list", tmp_path / "all" / f"list {n}")
+        told[f"list {n}"] = SAID["list"]
+    rows, most = check(tmp_path, ())
+    judge(rows, told)
+    assert len(rows) == 40
+    assert most < 3 << 30
+    assert no_process_is_left()
+
+
+@pytest.mark.process
+def test_a_table_that_was_cut_short_gets_the_rows_that_it_lacks(tmp_path, call, refused):
+    for name in ("anna", "bert", "carl"):
+        (tmp_path / name).mkdir()  # no file: nothing runs
+    table = tmp_path / "points.csv"
+    names = [str(tmp_path / name) for name in ("anna", "bert", "carl")]
+    lines = call("class check", *names).out.splitlines(keepends=True)
+    assert len(lines) == 4
+    anna = next(line for line in lines if line.startswith("anna"))
+    table.write_text(lines[0] + anna.replace("0.0", "7.0") + lines[2][:20])
+    call("class check --resume", table, *names)
+    rows = sorted(table.read_text().splitlines()[1:])
+    assert [row[:4] for row in rows] == ["anna", "bert", "carl"]
+    assert rows[0].startswith("anna,7.0")  # the row of the earlier call stays
+    table.write_text("name,mark\n")
+    assert "other columns" in refused("class check --resume", table, *names)
+    assert table.read_text() == "name,mark\n"
