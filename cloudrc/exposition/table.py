@@ -181,8 +181,8 @@ cloudrc_mission_waypoint: Index of the next waypoint; -1 if none.
 cloudrc_waypoints_reached_total: Waypoints reached, as teleop sees it; `waypoints_reached` in the
     report also checks the true position.
 cloudrc_missions_total[outcome]: Missions ended, by outcome.
-cloudrc_missions_judged_total[verdict] = verdict_*: Missions ended, by verdict: one that is done may
-    have failed its criteria. The report, which knows the true path, may judge otherwise.
+cloudrc_missions_failed_total = missions_failed: Missions whose verdict is a failure: one that is
+    done may have failed its criteria. The report, which knows the true path, may judge otherwise.
 cloudrc_api_requests_total = api_served: Requests that the API has served.
 cloudrc_api_rejected_total[reason] = api_*: Requests that the API rejected, by reason.
 cloudrc_missions_refused_total[reason] = api_order_*: Mission orders that the API refused, by
@@ -234,7 +234,6 @@ _LABELS: Mapping[str, Labels] = {
     "mode": ("auto", "relay", "netem"),
     "cloudrc_datagrams_total outcome": OUTCOMES,
     "cloudrc_missions_total outcome": MISSION_OUTCOMES,
-    "verdict": ("success", "failure", "invalid", "interrupted"),
     # "token": no valid token; "role": a reader's token; "busy": too many requests at a time.
     "cloudrc_api_rejected_total reason": ("token", "role", "busy"),
     # "conflict": another mission is in the way.

@@ -142,8 +142,8 @@ def _fly(
             service.tell_link(text, now_ns)
         if exporter is not None:
             exporter.ready(service.seen is not None)
-            verdicts = {f"verdict_{each}": n for each, n in service.verdicts.items()}
-            counts = {"api_events_dropped": service.book.dropped, **server.counts, **verdicts}
+            counts = {"api_events_dropped": service.book.dropped, **server.counts}
+            counts["missions_failed"] = service.failed
             exporter.see([Counted(0, "teleop", name, count) for name, count in counts.items()])
         return over()
 

@@ -6,7 +6,6 @@ has restarted. If an emergency stop has not reached the robot, the new process s
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -39,7 +38,7 @@ class MissionRunner:
         book: The missions.
         current: The mission under way; None without one.
         ends: Whether this process ends; the next process flies the queue.
-        verdicts: Number of missions that have ended in this process, by verdict.
+        failed: Number of missions whose verdict in this process was a failure.
     """
 
     def __init__(self, book: MissionStore, fence: Fence, units: Mapping[str, str]) -> None:
@@ -49,7 +48,7 @@ class MissionRunner:
         """
         self.book, self.ends = book, False
         self.current: MissionRecord | None = None
-        self.verdicts = Counter[str]()
+        self.failed = 0
         self._teleop, self._fence = Teleop(fence, book.has_ended), fence
         self._view = RobotView(units)
         self._outputs: list[Output | Fault] = []
@@ -182,7 +181,7 @@ class MissionRunner:
         if mission is self.current:
             changed["elapsed"] = round(self._flight.elapsed(now_ns), 3)
         if "verdict" in changed:
-            self.verdicts[changed["verdict"]["outcome"]] += 1
+            self.failed += changed["verdict"]["outcome"] == "failure"
         self.book.note(mission, event, text, **changed)
 
     def tell_link(self, text: str, now_ns: int) -> None:

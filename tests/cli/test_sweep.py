@@ -176,6 +176,9 @@ def test_a_killed_sweep_continues_to_equal_bytes(write_sweep):
 class Release:
     where = "in namespace 'lab'"
 
+    def patient(self, tell):
+        return self
+
 
 @pytest.fixture
 def pods(monkeypatch):
