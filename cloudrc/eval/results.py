@@ -86,7 +86,7 @@ TESTS = {
 """Head -> cell of the table of tests."""
 
 
-FLAT = ("seed", "verdict", "ended", "records_sha256", "code")
+FLAT = ("seed", "verdict", "ended", "link_start", "records_sha256", "code")
 """Fields of a row that a flat line has beside its condition and its numbers."""
 
 
@@ -200,7 +200,7 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
     """Write a flat line per episode into a CSV or Parquet file; times are in s."""
     columns = columns_of(rows, ("rtt_ms", "executor"), FLAT)
     times = [name for name in columns if "age" in name or "delay" in name]
-    units = {name: "s" for name in times if not name.endswith("_of")}
+    units = {name: "s" for name in (*times, "link_start") if not name.endswith("_of")}
     write_table(path, columns, units)
 
 

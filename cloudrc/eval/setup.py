@@ -117,7 +117,7 @@ class EvalSetup:
         if (count := self.sent["observation_packets"]) > 1:
             text += f" in {count:,} packets ({self.delivery})"
         on_link = self.sent.get("on_link_ms")
-        return text if on_link is None else f"{text}, {on_link:.2g} ms on the link"
+        return text if on_link is None else f"{text}, {float(f'{on_link:.2g}'):g} ms on the link"
 
     def identity(self) -> dict[str, Any]:
         """Return all that the result of an episode depends on, but its condition and seed: JSON."""

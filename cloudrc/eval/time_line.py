@@ -120,4 +120,4 @@ def describe_met(found: Mapping[str, Any]) -> Iterator[str]:
         if each["met"]:
             yield f"{name}: met by {each['met']} of {count} episodes"
         else:
-            yield f"no episode reached the {name}: the longest has {found['longest']:.1f} s"
+            yield f"no episode met the {name}: the longest has {found['longest']:.1f} s"

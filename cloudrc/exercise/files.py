@@ -131,7 +131,9 @@ def describe_missing(folder: Path, names: Collection[str]) -> str:
         if path.is_file() and not _is_notebook(path):
             continue
         near = get_close_matches(name.lower(), others, n=1, cutoff=0.7)
-        notebooks = [other for other in files if other.suffix == ".ipynb"]
+        # A notebook with the name of another part is no candidate for this one.
+        stems = {Path(other).stem for other in names} - {stem}
+        notebooks = [each for each in files if each.suffix == ".ipynb" and each.stem not in stems]
         twins = [str(other.relative_to(folder)) for other in files if other.name == name]
         if path.is_file():
             command = f"jupyter nbconvert --to script {stem}.ipynb"
@@ -141,7 +143,8 @@ def describe_missing(folder: Path, names: Collection[str]) -> str:
         elif near and others[near[0]].suffix != ".ipynb":
             text = f"is missing; there is '{others[near[0]].name}': rename it to {name}"
         elif notebooks:
-            other = str((others[near[0]] if near else notebooks[0]).relative_to(folder))
+            fits = [each for each in notebooks if near and each == others[near[0]]]
+            other = str((fits or notebooks)[0].relative_to(folder))
             command = f"jupyter nbconvert --to script {quote(other)} --output {stem}"
             text = f"is missing; there is the notebook '{other}': {command}"
         else:

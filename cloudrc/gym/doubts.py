@@ -33,7 +33,7 @@ def _describe_loss(wire: Wire) -> Iterator[str]:
     pieces = [piece for piece in Timeline(wire.profile).pieces if not piece.blackout]
     for piece in pieces:
         intact = (1.0 - wire.profile.corrupt) ** count
-        overflows = piece.rate is not None and queue < count
+        overflows = bool(wire.rates) and queue < count
         shares.append(0.0 if overflows else intact * whole_share(piece.loss, count))
     if min(shares, default=1.0) == 1.0:
         return
@@ -47,9 +47,8 @@ def _describe_loss(wire: Wire) -> Iterator[str]:
 
 
 def _describe_rate(wire: Wire, dt: float) -> Iterator[str]:
-    rates = [piece.rate for piece in Timeline(wire.profile).pieces if piece.rate]
-    needed = wire.bits / dt
-    if rates and needed > min(rates) * (1.0 + 1e-9):
+    rates, needed = wire.rates, wire.bits / dt
+    if wire.exceeds_rate(dt):
         at_times = " at times" * (min(rates) < max(rates))
         way = "uplink" if wire.uplink else "downlink"
         yield (

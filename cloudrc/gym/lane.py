@@ -10,7 +10,8 @@ from cloudrc.link.carry.tcp.medium import Medium
 from cloudrc.link.carry.tcp.stream import MessageStream, run_due
 from cloudrc.link.library import Cut, LinkProfile, OneWay
 from cloudrc.link.model import HEADER_BYTES
-from cloudrc.link.profile import DirectionProfile, summary
+from cloudrc.link.opportunities import BYTES as OPPORTUNITY_BYTES
+from cloudrc.link.profile import DirectionProfile, Timeline
 from cloudrc.link.queue import PacketQueue
 
 DATAGRAMS, STREAM = "datagrams", "stream"
@@ -53,10 +54,21 @@ class Wire(NamedTuple):
         return 8 * (self.size + self.cut.usual * HEADER_BYTES)
 
     @property
+    def rates(self) -> tuple[float, ...]:
+        """Rates of the bottleneck over time [bit/s]; of opportunities the mean; () without one."""
+        times_ns = self.profile.opportunities
+        if times_ns:
+            return (len(times_ns) * 8.0 * OPPORTUNITY_BYTES / (times_ns[-1] * 1e-9),)
+        return tuple(piece.rate for piece in Timeline(self.profile).pieces if piece.rate)
+
+    @property
     def occupies(self) -> float:
-        """Time for which a usual message occupies the bottleneck [s]; NaN without one."""
-        rate = summary(self.profile)["rate"]
-        return self.bits / rate if rate else nan
+        """Time for which a usual message occupies the bottleneck at first [s]; NaN without one."""
+        return self.bits / self.rates[0] if self.rates else nan
+
+    def exceeds_rate(self, period: float) -> bool:
+        """Return whether a message per `period` [s] is more than the bottleneck has, at times."""
+        return bool(self.rates) and self.bits / period > min(self.rates) * (1.0 + 1e-9)
 
 
 class Lane:

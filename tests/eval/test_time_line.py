@@ -23,7 +23,7 @@ def test_the_episodes_that_met_a_handover_are_told():
     assert [each["met"] for each in found["events"]] == [1, 0]
     told = [*describe_met(found)]
     assert told[1] == "outage at 10 s (0.05 s): met by 1 of 4 episodes"
-    assert told[2] == "no episode reached the outage at 20 s (0.3 s): the longest has 10.0 s"
+    assert told[2] == "no episode met the outage at 20 s (0.3 s): the longest has 10.0 s"
 
 
 def test_an_episode_meets_an_event_of_the_next_pass():

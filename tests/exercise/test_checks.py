@@ -17,7 +17,7 @@ from cloudrc import exercise
 from cloudrc.config.shipped import file_of
 from cloudrc.config.task import read_task
 from cloudrc.exercise import checks, scoring
-from cloudrc.exercise.files import SHIPPED
+from cloudrc.exercise.files import SHIPPED, describe_missing
 from cloudrc.exercise.watch import Limits
 from tests.conftest import nightly, wait_until
 
@@ -316,3 +316,10 @@ def test_files_are_not_overwritten_and_a_folder_must_exist(tmp_path, refused):
     refused("class check", tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     assert "has none of delay_estimator.py" in refused("class check", tmp_path / "empty")
+
+
+def test_a_notebook_is_the_remedy_for_its_own_part_alone(tmp_path):
+    (tmp_path / "predictor.ipynb").write_text("{}")
+    said = describe_missing(tmp_path, ["predictor.py", "controller.py"])
+    assert said.count("nbconvert") == 1
+    assert said.endswith("controller.py is missing")

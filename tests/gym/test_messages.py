@@ -6,6 +6,7 @@ from statistics import fmean
 
 import numpy as np
 import pytest
+from gymnasium.wrappers import TimeLimit
 
 import cloudrc.link
 from cloudrc.gym import Networked
@@ -173,6 +174,31 @@ def test_messages_that_a_link_cannot_carry_are_told_in_one_line(link, options, t
     with pytest.warns(LinkWarning, match=text) as found:
         Networked(Counter(), {"uplink": link}, observation_bytes=IMAGE, **options)
     assert len(found) == 1
+
+
+@pytest.fixture
+def megabit(tmp_path):
+    """The path of a capacity trace: 1,500 bytes every 12 ms."""
+    (tmp_path / "b.up").write_text("".join(f"{12 * n}\n" for n in range(1, 51)))
+    return str(tmp_path / "b.up")
+
+
+def test_a_capacity_trace_is_a_bottleneck_for_messages_too(megabit):
+    link = {"uplink": {"rate_trace": megabit, "queue_packets": 5}}
+    assert wire(link, 12_000).occupies == pytest.approx((12_000 + 10 * 28) * 8 / 1e6)
+    assert expected(wire(link, 12_000), 0.05)[1] == 1.0  # ten packets, five places
+    found, summary = delays(link, 4_000, "stream", 50, 50)
+    assert not np.isnan(found).any()
+    assert summary["packets_lost"] == 0, "the sender waits for room"
+
+
+@pytest.mark.filterwarnings("ignore:.*arrive whole")
+def test_a_rate_that_is_exceeded_is_told_and_no_delay_guessed(megabit):
+    env = TimeLimit(Counter(), 200)
+    for link in ({"rate_kbit": 500}, {"rate_trace": megabit}):
+        with pytest.warns(LinkWarning, match="its queue fills") as found:
+            Networked(env, {"uplink": link}, observation_bytes=40_000, delivery="stream")
+        assert len(found) == 1
 
 
 def test_a_robot_that_asks_rarely_is_not_told_about_the_rate():

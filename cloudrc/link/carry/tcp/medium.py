@@ -51,6 +51,8 @@ class Medium:
         self._queue_packets, self._timeline = profile.queue_packets, Timeline(profile)
         changes = tuple(replace(change, rate_kbit=None) for change in profile.changes)
         behind = replace(profile, rate_kbit=None, changes=changes)  # what follows the bottleneck
+        if profile.opportunities:  # their bottleneck stays there: a segment that waits is not lost
+            behind = replace(behind, queue_packets=_NO_LIMIT)
         self._link.replace_profile(behind, restart=restart, start_ns=start_ns)
 
     def delay_ns(self, now_ns: int) -> int:
