@@ -34,11 +34,6 @@ class Wire(NamedTuple):
         return self.link.uplink if self.uplink else self.link.downlink
 
     @property
-    def back(self) -> DirectionProfile:
-        """The profile of the other direction."""
-        return self.link.downlink if self.uplink else self.link.uplink
-
-    @property
     def cut(self) -> Cut:
         """How messages are cut into packets."""
         return Cut(self.packet_bytes).for_size(self.size)
