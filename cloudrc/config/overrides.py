@@ -18,9 +18,10 @@ import inspect
 import json
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from functools import lru_cache, reduce
+from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
+from weakref import WeakKeyDictionary
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
@@ -47,6 +48,8 @@ GIVEN = {
     *(("predictors", "robot"), ("controllers", "robot")),
 }
 """Kind of plug-in and argument of its `build` that cloudrc gives, not the user."""
+_models = WeakKeyDictionary[Callable[..., Any], type[BaseModel]]()
+"""`build` of a plug-in -> the model of its parameters. It keeps no module of a user alive."""
 _DEFAULTS = {
     **Experiment().model_dump(mode="json"),
     "mission": {"steps": Steps().model_dump(mode="json")},
@@ -314,11 +317,16 @@ def default_parameters(kind: str, name: str) -> dict[str, Any]:
 
 def parameter_model(kind: str, name: str) -> type[BaseModel]:
     """Create a pydantic model of a plug-in's parameters from the signature of its `build`."""
-    key = "parameters", kind, name
-    return reuse(key, lambda: _model_of(kind, name, plugins.builder(kind, name)))
+    return reuse(("parameters", kind, name), lambda: _known_model(kind, name))
 
 
-@lru_cache(maxsize=64)  # a pydantic model takes a millisecond
+def _known_model(kind: str, name: str) -> type[BaseModel]:
+    build = plugins.builder(kind, name)
+    if build not in _models:  # a pydantic model takes a millisecond
+        _models[build] = _model_of(kind, name, build)
+    return _models[build]
+
+
 def _model_of(kind: str, name: str, build: Callable[..., Any]) -> type[BaseModel]:
     """Create the model for `build`, the function of a plug-in; a changed file has a new one."""
     empty, parameters = inspect.Parameter.empty, plugins.signature(kind, name).parameters

@@ -187,7 +187,9 @@ def fly(test: TestConfig, own: Mapping[str, Path], beside: Path) -> tuple[float,
 
     `own` are the keys of the experiment that get the files.
     """
-    found = fly_in_memory(_experiment(test, own, beside))
+    experiment = _experiment(test, own, beside)
+    code.free_unused()  # the check of the experiment has executed each file once
+    found = fly_in_memory(experiment)
     known = found.numbers.get(test.number)
     value = test.none if known is None else known.value
     share = min(max((value - test.none) / (test.full - test.none), 0.0), 1.0)

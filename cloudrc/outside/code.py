@@ -12,6 +12,7 @@ flight sees what another one has left there, and two files may each have a modul
 from __future__ import annotations
 
 import ast
+import gc
 import importlib
 import os
 import sys
@@ -175,6 +176,13 @@ def _execute(path: Path) -> ModuleType:
         sys.modules[name] = module  # dataclasses look up their module there
         spec.loader.exec_module(module)
     return module
+
+
+def free_unused() -> None:
+    """Free the memory of users' modules from which nothing is left: a file may hold much data."""
+    for name in [each for each in sys.modules if each.startswith(PREFIX)]:
+        del sys.modules[name]
+    gc.collect()  # a module and its functions refer to each other
 
 
 @contextmanager

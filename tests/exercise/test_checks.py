@@ -323,3 +323,19 @@ def test_a_notebook_is_the_remedy_for_its_own_part_alone(tmp_path):
     said = describe_missing(tmp_path, ["predictor.py", "controller.py"])
     assert said.count("nbconvert") == 1
     assert said.endswith("controller.py is missing")
+
+
+ONE_COPY = """
+import sys, weakref
+class Data: pass
+data = Data()
+assert getattr(sys, "data_before", lambda: None)() is None, "there are two copies of the data"
+sys.data_before = weakref.ref(data)
+"""
+
+
+def test_the_data_of_a_file_is_in_memory_once(lecture, monkeypatch):
+    monkeypatch.setattr(sys, "data_before", lambda: None, raising=False)
+    Path("predictor.py").write_text(ONE_COPY + Path("predictor.py").read_text())
+    (row,) = checks.run(read_task(Path("own.yaml")), "predictor", lecture, lecture)
+    assert row["points"] > 0, row["seen"]
