@@ -119,7 +119,7 @@ def execute(options: Options) -> int:
                     folder, setup, episodes, options.jobs, known, view.count
                 )
             except CloudrcError:
-                tell(f"the rows are kept; the same call with --out {folder} goes on")
+                tell(f"what was played is kept; the same call with --out {folder} goes on")
                 raise
         if stopped:
             tell(f"{stopped}; {again(options.out, folder)}")

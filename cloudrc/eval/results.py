@@ -56,7 +56,7 @@ COLUMNS = {
     "round trip": "{rtt_ms:g} ms",
     "loop": "{loop_age_ms:.0f} ms",
     "executor": "{executor}",
-    "on link": "{observation_bytes:,} B, {on_link_ms:.2g} ms",
+    "on link": "{observation_bytes:,} B, {on_link_ms:g} ms",
     "return": "{return:.5g}",
     "95 %": "{return_low:.5g} .. {return_high:.5g}",
     "success": "{successes}/{episodes}",

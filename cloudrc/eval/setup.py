@@ -106,7 +106,9 @@ class EvalSetup:
             return {}
         wire = self.wire(self.sent_bytes, uplink=True)
         found = {"observation_bytes": wire.size, "observation_packets": wire.cut.usual}
-        return found if isnan(wire.occupies) else {**found, "on_link_ms": 1e3 * wire.occupies}
+        if isnan(wire.occupies):
+            return found
+        return {**found, "on_link_ms": round(1e3 * wire.occupies, 3)}  # to the microsecond
 
     @property
     def facts(self) -> str:
@@ -117,7 +119,7 @@ class EvalSetup:
         if (count := self.sent["observation_packets"]) > 1:
             text += f" in {count:,} packets ({self.delivery})"
         on_link = self.sent.get("on_link_ms")
-        return text if on_link is None else f"{text}, {float(f'{on_link:.2g}'):g} ms on the link"
+        return text if on_link is None else f"{text}, {on_link:g} ms on the link"
 
     def identity(self) -> dict[str, Any]:
         """Return all that the result of an episode depends on, but its condition and seed: JSON."""

@@ -244,7 +244,7 @@ def test_a_server_that_fails_keeps_the_rows_and_is_one_line(tmp_path, evaluate, 
         said = evaluate("--policy", url, "--seeds", 50, "--out", tmp_path / "e", code=5)
     error = said.err.splitlines()
     assert text in error[-1]
-    assert "rows are kept" in error[-2]
+    assert "is kept" in error[-2]
     assert len((tmp_path / "e" / "rows.jsonl").read_text().splitlines()) > 2
 
 
