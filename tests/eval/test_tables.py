@@ -148,7 +148,9 @@ def test_a_condition_without_any_answer_stands_at_the_asked_time():
 def test_the_bytes_of_an_observation_and_their_time_on_the_link_are_told(law, tmp_path, evaluate):
     words = "--link lte --rtt 0 --seeds 1 --observation-bytes 27600 --policy".split()
     run = evaluate(*words, law(), "--out", tmp_path / "a")
-    assert "27,600 bytes in 23 packets (datagrams), 22.595 ms" in run.err  # at 10 Mbit/s, with headers
+    assert (
+        "27,600 bytes in 23 packets (datagrams), 22.595 ms" in run.err
+    )  # at 10 Mbit/s, with headers
     assert "27,600 B, 22.595 ms" in run.out
     document = json.loads((tmp_path / "a" / "eval.json").read_text())
     found = document["outcomes"][1], document
