@@ -149,8 +149,8 @@ def _check(options: Options, given: Path, scratch: Path) -> None:
     from cloudrc.exercise.scoring import check
 
     hand_in = open_hand_in(given, options.task, scratch / "0")
-    if hand_in.refused:
-        raise BadInputError(hand_in.refused)
+    if hand_in.unreadable:
+        raise BadInputError(hand_in.unreadable)
     task = _read(hand_in.source)
     if options.output != "gradescope":  # there, a hand-in without the files gets 0 points
         _check_files(given, hand_in.folder, [*task.files.values()])

@@ -247,13 +247,13 @@ def _network_tells(
 ) -> Iterator[Finding]:
     """Yield what keeps the two ends of one robot from hearing each other."""
     grown = {place: _growth(before.get(place, {}), page) for place, page in after.items()}
-    if refusing := [
+    if deaf := [
         place[0]
         for place, counts in grown.items()
-        # Forged datagrams are refused, too, but do not silence the other end.
+        # Forged datagrams do not pass, either, but do not silence the other end.
         if _sum(counts, "cloudrc_datagrams_total", 'outcome="tag"') and not after[place][READY]
     ]:
-        text = f"the {' and the '.join(refusing)} pod refuses what arrives: the other end has"
+        text = f"the {' and the '.join(deaf)} pod rejects what arrives: the other end has"
         yield Finding("key", "missing", f"{text} another key", _same_key(release, objects))
         return
     for direction in (UPLINK, DOWNLINK):

@@ -29,7 +29,7 @@ from cloudrc.cluster.client import (
 from cloudrc.cluster.diagnosis import DNS_REMEDY, LOOK_UP, Finding, remedy
 from cloudrc.cluster.pods import container_statuses, pod_failure
 from cloudrc.cluster.releases import COMPONENT
-from cloudrc.errors import BadInputError, to_one_line
+from cloudrc.errors import CloudrcError, to_one_line
 
 NEEDED = {
     "": "pods services configmaps secrets serviceaccounts persistentvolumeclaims",
@@ -176,7 +176,7 @@ def experiments(rendered: list[Any]) -> Iterator[Finding]:
         try:
             load_experiment(folder / experiment)
             load_link(folder / profile, folder / experiment)
-        except BadInputError as error:
+        except CloudrcError as error:
             text = to_one_line(str(error).replace(f"{folder}/", ""))
             fix = "correct it in the values, below experiment or link"
             yield Finding("experiment", "missing", text, fix)
@@ -384,7 +384,7 @@ def _failed_probe(release: Release, node: str, pod: Any) -> Finding:
     words = [to_one_line(end.message) for end in ends if end and end.exit_code]
     if not any(text.startswith(IN_CLUSTER) for text in words):
         return Finding(node, "missing", f"its probe failed: {'; '.join(words)}")
-    # A policy of the namespace may refuse the probe what the chart's policies allow to its pods.
+    # A policy of the namespace may forbid the probe what the chart's policies allow to its pods.
     state: Literal["warn", "missing"]
     state = "warn" if release.request("list", "networkpolicies") else "missing"
     return Finding(node, state, f"a pod there cannot resolve a name: {words[0]}", DNS_REMEDY)

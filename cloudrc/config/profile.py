@@ -15,7 +15,6 @@ from cloudrc.config import problems, shipped
 from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.section import Section, leave_out_null
 from cloudrc.errors import BadInputError
-from cloudrc.link.opportunities import read_opportunities
 from cloudrc.link.profile import CLOUD_TIME_MAX as CLOUD_TIME_MAX
 from cloudrc.link.profile import COMMAND_AGE_MS as COMMAND_AGE_MS
 from cloudrc.link.profile import DIRECTIONS as DIRECTIONS
@@ -32,7 +31,7 @@ from cloudrc.link.profile import (
 )
 from cloudrc.link.profile import CloudTime as CloudTime
 from cloudrc.link.profile import CommandAge as CommandAge
-from cloudrc.link.traces import read_table, read_trace
+from cloudrc.link.traces import read_opportunities, read_table, read_trace
 from cloudrc.outside.document import Document, KeyPath
 from cloudrc.outside.reuse import reuse
 

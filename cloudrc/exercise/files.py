@@ -34,7 +34,7 @@ class HandIn(NamedTuple):
     """Where its files are"""
     source: Path
     """The task"""
-    refused: str = ""
+    unreadable: str = ""
     """Why it cannot be read"""
 
 

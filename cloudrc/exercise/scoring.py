@@ -84,19 +84,19 @@ def read_rows(data: bytes) -> list[tuple[float, str]]:
 
 
 def check(
-    folder: Path | None, source: Path = SHIPPED, limits: Limits = LIMITS, refused: str = ""
+    folder: Path | None, source: Path = SHIPPED, limits: Limits = LIMITS, unreadable: str = ""
 ) -> Iterator[dict[str, Any]]:
     """Score the student's files in a folder, each part within `limits`; None: cloudrc's own parts.
 
     `source` is the task. Yield one dictionary per test, when its part has ended: the test's name,
     its points, the result in words, and whether the points are valid. They are not if a part took
-    too long in real time. Without a file, or if the hand-in is `refused`, nothing runs.
+    too long in real time. Without a file, or if the hand-in is `unreadable`, nothing runs.
     """
     slow = f"too slow here: no end after {limits.seconds * limits.patience:g} s"
     task = read_task(source)
     for part, about in task.parts.items():
         names = [about.file] if about.file else [*task.files.values()]
-        why = refused or (describe_missing(folder, names) if folder else "")
+        why = unreadable or (describe_missing(folder, names) if folder else "")
         ran = PartResult(b"", "", why) if why else run_part(part, folder, source, limits)
         place = ran.place or about.file or "a file"
         if not why:
@@ -116,4 +116,6 @@ def check(
 
 def score(hand_in: HandIn, limits: Limits = LIMITS) -> tuple[str, dict[str, Any]]:
     """Return name and score of a hand-in."""
-    return hand_in.name, sum_up([*check(hand_in.folder, hand_in.source, limits, hand_in.refused)])
+    return hand_in.name, sum_up(
+        [*check(hand_in.folder, hand_in.source, limits, hand_in.unreadable)]
+    )

@@ -148,7 +148,7 @@ def connect(
 
 
 def check_kind(env: Any, kind: type, name: str) -> None:
-    """Refuse what is no environment of the `kind`, a class of gymnasium with this `name`."""
+    """Raise an error about an environment of another `kind`, gymnasium's class `name`."""
     if isinstance(env, kind):
         return
     who = f"{type(env).__name__} is no {name} of gymnasium"

@@ -10,46 +10,9 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
-from functools import lru_cache
-from pathlib import Path
-
-from cloudrc.errors import BadInputError
-from cloudrc.files import version
-from cloudrc.outside.paths import read_file
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import InvalidValueError, Quantity
 
 BYTES = 1500
 """What may leave at an opportunity [bytes]."""
-SUFFIXES = {".up": "uplink", ".down": "downlink"}
-"""End of the name of a file that mahimahi has recorded -> its direction."""
-_SIZE_MAX = 64 << 20  # size limit of a file [bytes]
-_TIME = Quantity("ms", ge=0, le=1e9, whole=True)
-
-
-def read_opportunities(path: Path, size_max: int = _SIZE_MAX) -> tuple[int, ...]:
-    """Read the times of the opportunities [ns]; an unchanged file is read once.
-
-    Raises:
-        BadInputError: If the file cannot be read, or if its times do not rise.
-    """
-    return _read(path, size_max, version(path))
-
-
-@lru_cache(maxsize=4)
-def _read(path: Path, size_max: int, state: object) -> tuple[int, ...]:
-    """Read a file; `state` changes with it."""
-    name, times = f"rate_trace {path}", list[int]()
-    data = read_file(path, name, "give a file of mahimahi: a line per packet, in ms", size_max)
-    for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
-        with naming(f"{name}, line {number}"):
-            time = _TIME.read(line)
-            if times and time < times[-1]:
-                raise InvalidValueError(f"{time} ms comes before {times[-1]} ms")
-        times.append(time)
-    if not times or not times[-1]:
-        raise BadInputError(f"{name}: its last line is its period in ms, and must be above 0")
-    return tuple(time * 1_000_000 for time in times)
 
 
 class Opportunities:

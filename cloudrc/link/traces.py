@@ -1,7 +1,7 @@
 """Read and write traces: CSV files of delay and loss over time, which link profiles use.
 
 A trace has the columns `time_s` and `delay_ms`, also in other units, and may have `loss`. Each row
-is an instant, in rising order of time. Delays are one way.
+is an instant, in rising order of time. Delays are one way. A trace of rates is a file of mahimahi.
 `link/trace_logs.py` converts the logs of other tools to traces.
 """
 
@@ -16,7 +16,6 @@ from typing import Any
 
 from cloudrc.errors import BadInputError
 from cloudrc.files import version
-from cloudrc.link.opportunities import read_opportunities
 from cloudrc.link.profile import (
     Blackout,
     Change,
@@ -26,12 +25,18 @@ from cloudrc.link.profile import (
     Trace,
     refuse_period,
 )
+from cloudrc.outside.paths import read_file
+from cloudrc.outside.refusal import naming
 from cloudrc.outside.tables import SECONDS, SHARE, SIZE_MAX, CsvTable, read_lines
-from cloudrc.outside.values import Quantity
+from cloudrc.outside.values import InvalidValueError, Quantity
 from cloudrc.rounding import differences
 
 START_MAX = 600.0  # if the first row is later, times count from the first row [s]
 EXAMPLE = "time_s,delay_ms,loss"
+RATE_SUFFIXES = {".up": "uplink", ".down": "downlink"}
+"""End of the name of a file that mahimahi has recorded -> its direction."""
+_RATES_MAX = 64 << 20  # size limit of a trace of rates [bytes]
+_TIME = Quantity("ms", ge=0, le=1e9, whole=True)
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
@@ -93,6 +98,31 @@ def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
     mean = fsum(delays) / len(delays)
     deviation = sqrt(fsum((delay - mean) ** 2 for delay in delays) / len(delays))
     return tuple(sorted((delay - mean) / deviation for delay in delays))
+
+
+def read_opportunities(path: Path, size_max: int = _RATES_MAX) -> tuple[int, ...]:
+    """Read the times of the opportunities [ns]; an unchanged file is read once.
+
+    Raises:
+        BadInputError: If the file cannot be read, or if its times do not rise.
+    """
+    return _read_opportunities(path, size_max, version(path))
+
+
+@lru_cache(maxsize=4)
+def _read_opportunities(path: Path, size_max: int, state: object) -> tuple[int, ...]:
+    """Read a file; `state` changes with it."""
+    name, times = f"rate_trace {path}", list[int]()
+    data = read_file(path, name, "give a file of mahimahi: a line per packet, in ms", size_max)
+    for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
+        with naming(f"{name}, line {number}"):
+            time = _TIME.read(line)
+            if times and time < times[-1]:
+                raise InvalidValueError(f"{time} ms comes before {times[-1]} ms")
+        times.append(time)
+    if not times or not times[-1]:
+        raise BadInputError(f"{name}: its last line is its period in ms, and must be above 0")
+    return tuple(time * 1_000_000 for time in times)
 
 
 def parse_trace(lines: Iterable[str], name: str) -> Trace:

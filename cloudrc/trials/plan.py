@@ -15,7 +15,7 @@ from cloudrc import files, source
 from cloudrc.config import sweep
 from cloudrc.config.resolved import ResolvedExperiment, local_files
 from cloudrc.config.sweep import Draft
-from cloudrc.errors import BadInputError, StateError
+from cloudrc.errors import CloudrcError, StateError
 from cloudrc.metrics import measure
 from cloudrc.outside.refusal import reading
 from cloudrc.outside.reuse import reuse_results
@@ -93,7 +93,7 @@ class SweepPlan:
         """
         try:
             before = f"{load(self.draft.experiment, []).guard.speed_max_mps:.3g}"
-        except BadInputError:  # the experiment flies with the settings alone
+        except CloudrcError:  # the experiment flies with the settings alone
             return ""
         places = defaultdict[str, list[list[str]]](list)
         for (labels, _), point in zip(self.draft.points(), self.points, strict=True):

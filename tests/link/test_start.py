@@ -7,8 +7,9 @@ import pytest
 from cloudrc import link
 from cloudrc.errors import BadInputError
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.opportunities import Opportunities, read_opportunities
+from cloudrc.link.opportunities import Opportunities
 from cloudrc.link.profile import Timeline
+from cloudrc.link.traces import read_opportunities
 from tests.link.profiles import profile_of
 
 BLACKOUT = {"blackouts": [{"start_s": 1, "duration_s": 0.5}], "repeat_s": 4}
