@@ -8,7 +8,7 @@ the numbers of each piece come from the model, as do those of larger messages an
 from __future__ import annotations
 
 from functools import lru_cache
-from math import isnan, nan
+from math import ceil, isnan, nan
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -49,8 +49,11 @@ class Met(NamedTuple):
 
 def asked_of(wire: Wire, period: float, met: Met) -> tuple[float, float]:
     """Return the mean delay [s] and the loss of messages, one per `period` [s], in what was met."""
-    parts = _parts_of(wire, period)
-    return parts.of(met) if parts else expected(wire, period)
+    if parts := _parts_of(wire, period):
+        return parts.of(met)
+    # A queue that fills has no mean but that of the messages which were sent.
+    count = ceil(met.duration_ns * 1e-9 / period) if wire.exceeds_rate(period) else 0
+    return expected(wire, period, count)
 
 
 @lru_cache(maxsize=64)
@@ -60,13 +63,17 @@ def _parts_of(wire: Wire, period: float) -> PartsAsked | None:
 
 
 @lru_cache(maxsize=64)
-def expected(wire: Wire, period: float) -> tuple[float, float]:
-    """Return the mean delay [s] and the loss of messages, one per `period` [s], from time 0 on."""
+def expected(wire: Wire, period: float, count: int = 0) -> tuple[float, float]:
+    """Return the mean delay [s] and the loss of messages, one per `period` [s], from time 0 on.
+
+    `count` is the number of messages in several packets, or of a stream; 0: as many as the model
+    needs for a mean.
+    """
     profile, pieces = wire.profile, wire.cut.usual
     if wire.is_plain:
         asked = OneWay(profile, 0, uplink=True).expected(period, wire.size)
         return asked.mean, asked.loss
-    sent_ns = np.arange(max(MESSAGES_MIN, PIECES // pieces)) * round(period * 1e9)
+    sent_ns = np.arange(count or max(MESSAGES_MIN, PIECES // pieces)) * round(period * 1e9)
     delays = _delays_of(wire, sent_ns.tolist(), 0)
     came = delays[np.isfinite(delays)]
     loss = 1.0 - len(came) / len(delays)

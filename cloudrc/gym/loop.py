@@ -174,10 +174,11 @@ class RemoteLoop:
 
     def _ticks_late(self, wires: tuple[Wire, Wire]) -> int:
         """Return the expected age of the loop [ticks]."""
-        settings = self._settings
-        (up, _), (down, _) = (expected(wire, settings.dt) for wire in wires)
+        settings, dt = self._settings, self._settings.dt
+        # Of a queue that fills, the first message tells the least age.
+        (up, _), (down, _) = (expected(wire, dt, int(wire.exceeds_rate(dt))) for wire in wires)
         late = float(np.nan_to_num(up + down)) + settings.compute[0] - settings.answer_within
-        return max(0, ceil(late / settings.dt - 1e-6))
+        return max(0, ceil(late / dt - 1e-6))
 
     def doubts(self, link: LinkProfile, count: int, longest: float) -> Iterator[str]:
         """Say what makes episodes of at most `longest` [ticks] over a link pointless.

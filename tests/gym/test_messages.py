@@ -10,7 +10,7 @@ from gymnasium.wrappers import TimeLimit
 
 import cloudrc.link
 from cloudrc.gym import Networked
-from cloudrc.gym.asked import expected
+from cloudrc.gym.asked import Met, asked_of, expected
 from cloudrc.gym.doubts import LinkWarning
 from cloudrc.gym.lane import Lane, Wire
 from cloudrc.link.carry.tcp.stream import MessageStream, Segment
@@ -199,6 +199,14 @@ def test_a_rate_that_is_exceeded_is_told_and_no_delay_guessed(megabit):
         with pytest.warns(LinkWarning, match="its queue fills") as found:
             Networked(env, {"uplink": link}, observation_bytes=40_000, delivery="stream")
         assert len(found) == 1
+
+
+def test_the_delay_of_a_queue_that_fills_is_asked_of_the_messages_of_the_episode():
+    link = {"rate_kbit": 500, "queue_packets": 10_000}
+    found, _ = delays({"uplink": link}, 40_000, "stream", 50, 20)
+    asked = asked_of(wire({"uplink": link}, 40_000, "stream"), 0.02, Met(0, 50 * 20 * MS))
+    assert asked == pytest.approx((found.mean() / 1e3, 0.0))
+    assert found[-1] > 40 * found[0]
 
 
 def test_a_robot_that_asks_rarely_is_not_told_about_the_rate():
