@@ -35,6 +35,7 @@ class Period:
     uplink: bool
     first: int  # number of the first packet
     origin_ns: int  # start of the profile's time line, monotonic clock [ns]
+    cuts: bool = False  # whether large messages travel as several packets
 
 
 def judge_packets(log: PacketLog, period: Period) -> list[tuple[float, Judgement]]:
@@ -56,7 +57,7 @@ def judge_packets(log: PacketLog, period: Period) -> list[tuple[float, Judgement
     if limited:  # a packet waits for those before it
         few = slice(QUEUED_PACKETS)
     asked = replace(plan, sent=applied.sent[few]).asked()
-    if size > PACKET_BYTES:  # of a message in several packets, only the applied values are known
+    if period.cuts and size > PACKET_BYTES:  # only the applied values of such a message are known
         asked = dict.fromkeys(asked, nan)
     if not limited:
         asked["reordered"] = nan  # depends on how close to each other packets are sent

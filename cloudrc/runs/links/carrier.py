@@ -144,7 +144,8 @@ class LiveLink:
     def period(self, way: str) -> Period:
         """Return which packets of a direction followed its present profile."""
         first, origin_ns = self.ways[way].first, self.origins_ns[way]
-        return Period(self.profile(way), self.seed, way == "uplink", first, origin_ns)
+        cuts = isinstance(self._followers.get(way), MessageWay)
+        return Period(self.profile(way), self.seed, way == "uplink", first, origin_ns, cuts)
 
     def counts(self) -> dict[str, int]:
         """Return the number of packets by outcome, and their lateness [ns]."""

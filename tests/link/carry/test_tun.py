@@ -3,6 +3,7 @@
 import socket
 from contextlib import ExitStack
 from functools import partial
+from math import isnan
 from types import SimpleNamespace
 
 import pytest
@@ -58,21 +59,21 @@ def test_a_packet_leaves_when_it_is_due_and_not_before(clock):
     assert 0 <= way.log.left[0] - way.log.due[0] < 2 * MS
 
 
-def log_of(profile, late_ns=0, count=2000):
-    """Make the log of a relay that adds `late_ns` to each packet [ns]."""
+def log_of(profile, late_ns=0, count=2000, size=100):
+    """Make the log of a relay that adds `late_ns` to each packet of a `size` [ns, bytes]."""
     log, model = PacketLog(), LinkDirection(profile, 7, True)
     for number in range(count):
         sent_ns = number * 10 * MS
-        fate = model.send(1, KIND, number, 72, sent_ns)
-        log.enter(sent_ns, 100, fate)
+        fate = model.send(1, KIND, number, size - 28, sent_ns)
+        log.enter(sent_ns, size, fate)
         for due_ns in fate:
             log.leave(number, due_ns + late_ns)
     return log
 
 
-def judged(log, profile):
+def judged(log, profile, cuts=False):
     """Return what the profile asks of these packets, and the verdicts, by quantity."""
-    rows = judge_packets(log, Period(profile, 7, True, 0, 0))
+    rows = judge_packets(log, Period(profile, 7, True, 0, 0, cuts))
     return {row.name: value for value, row in rows}, {row.name: row.verdict for _, row in rows}
 
 
@@ -87,6 +88,13 @@ def test_a_relay_is_believed_unless_it_is_late_or_loses_packets_by_itself():
     for number in range(0, 2000, 10):
         log.copies[number] = 0
     assert judged(log, profile)[1]["loss"] == "off"
+
+
+def test_a_large_packet_is_asked_for_as_a_small_one_and_a_message_in_pieces_is_not():
+    profile = profile_of(0.040, 0.010)
+    log = log_of(profile, size=1500)
+    assert judged(log, profile)[0]["mean"] == pytest.approx(0.040, abs=5e-4)
+    assert isnan(judged(log, profile, cuts=True)[0]["mean"])
 
 
 @pytest.mark.parametrize(
