@@ -53,13 +53,26 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-cell results docs site dist owner images kind-load lock clean
+.PHONY: help demo live live-flight test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-cell results docs site dist owner images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: $(VENV)/all ## fly the paper's mission in real time and write its report
-	$(bin)/cloudrc run $(EXPERIMENT) --mode local
+demo: $(VENV)/all ## fly the paper's mission in virtual time and write its report: seconds
+	@$(bin)/cloudrc run $(EXPERIMENT) --mode virtual
+	@printf '\nnext:\n  %-31s %s\n  %-31s %s\n' \
+		'make live' 'the same in real time: processes and UDP on this machine' \
+		'$(bin)/cloudrc up --console' 'a page in the browser: watch and steer the robot'
+
+# The flight is a step of its own: else "Error 6" is the last line that a person sees.
+live: live-flight ## fly the same mission in real time, over UDP on this machine
+	@$(if $(filter 6,$(shell cat $(VENV)/live)),$(error $(TOO_SLOW)))exit $$(cat $(VENV)/live)
+
+live-flight: $(VENV)/all
+	@$(bin)/cloudrc run $(EXPERIMENT) --mode local; echo $$? > $(VENV)/live
+
+TOO_SLOW = INVALID, this machine was too busy: close other programs and fly again, or fly in virtual \
+	time with 'make demo'
 
 test: $(VENV)/dev ## run the default tests on all cores; of one part: make test T=tunnel
 	$(bin)/pytest -n auto $(PART)
@@ -308,20 +321,21 @@ clean: ## remove the environment and generated folders
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 		echo "cloudrc needs Python 3.11 or newer; name one: make PYTHON=python3.12 ..." >&2; exit 3; }
-	$(PYTHON) -m venv $(VENV)
+	@echo "makes the environment $(VENV)"
+	@$(PYTHON) -m venv $(VENV)
 
 # Byte code of all packages takes 140 MB and eight seconds; Python makes that of the used modules.
-INSTALL = $(bin)/python -m pip install --disable-pip-version-check --no-compile --editable
+INSTALL = $(bin)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable
 
 $(VENV)/all: pyproject.toml | $(VENV)/bin/python
-	@echo "installs cloudrc and its packages into $(VENV), once: half a minute, 430 MB"
-	@echo "(MuJoCo, matplotlib, the clients of Kubernetes and of the browser, NumPy)"
-	$(INSTALL) '.[all]'
+	@echo "installs cloudrc and its packages into it, once: half a minute, 430 MB"
+	@echo "(MuJoCo, matplotlib, NumPy, the clients of Kubernetes and of the browser)"
+	@$(INSTALL) '.[all]'
 	@touch $@
 
 $(VENV)/dev: pyproject.toml | $(VENV)/bin/python
 	@echo "installs cloudrc, its packages and its test tools into $(VENV), once: a minute, 900 MB"
-	$(INSTALL) '.[dev]'
+	@$(INSTALL) '.[dev]'
 	@touch $(VENV)/all $@
 
 # Not an extra: pip would install cloudrc again, while .ci/run flies with it.

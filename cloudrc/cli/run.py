@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from shlex import quote, split
@@ -146,7 +146,18 @@ def fly_once(options: Options, mode: str, ready: Ready | None = None) -> int:
     print_traceback(options, report)
     last = "report.html" if options.report == "page" else "report.json"
     print_result(options.output, report, summary(report, folder, last))
+    _advise(report)
     return 0 if ready else exit_code(report)
+
+
+def _advise(report: Mapping[str, Any]) -> None:
+    """Say in the last line what to do if the machine was too slow for a flight in real time."""
+    from cloudrc.metrics.verdict import ADVICE
+
+    codes = [failure["code"] for failure in report["failures"]]
+    codes += [robot.get("why", "") for robot in report.get("robots", ())]
+    if any("not_real_time" in each for each in codes):
+        tell(f"the flight did not keep real time: {ADVICE}, or fly with --mode virtual")
 
 
 def _warn(options: Options, experiment: ResolvedExperiment, *flights: ResolvedExperiment) -> None:
@@ -215,6 +226,7 @@ def _fly_fleet(experiment: ResolvedExperiment, options: Options, *, is_session: 
     last = folder / ("report.html" if page else "report.json")
     text = f"\n{summarize_fleet(report, paint)}\n\n{escape(str(last))}"
     print_result(options.output, report, text)
+    _advise(report)
     return exit_code(report)
 
 

@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.cli.main import main
+from cloudrc.metrics.verdict import FlightFailure, FlightVerdict
 from cloudrc.report.figures import FIGURES
 from cloudrc.runs import requirements
 from tests.cli.conftest import FLY, SHORT
@@ -99,6 +100,15 @@ def test_a_report_that_cannot_be_written_can_be_later(fails, error, code, said, 
         changed.setattr(f"cloudrc.{fails}", Mock(side_effect=error))
         assert said in call(*FLY, "--out", "here", code=code).err
     call("report here")
+
+
+@pytest.mark.usefixtures("no_page")
+def test_a_flight_that_did_not_keep_real_time_ends_with_what_to_do(monkeypatch, call):
+    slow = FlightVerdict("invalid", (FlightFailure("not_real_time", "it was too slow"),))
+    monkeypatch.setattr("cloudrc.report.write.judge", lambda evidence: slow)
+    said = call(*FLY, code=6)
+    assert said.out.splitlines()[-1].endswith("report.html")
+    assert said.err.splitlines()[-1].endswith("or fly with --mode virtual")
 
 
 @pytest.mark.usefixtures("no_page")
