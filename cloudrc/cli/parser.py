@@ -18,44 +18,52 @@ from cloudrc.text import suggest_name, unknown_name_text
 from cloudrc.version import __version__
 
 GROUPS: dict[str, dict[str, str]] = {
-    "fly": {
+    "fly and steer": {
         "run": "fly an experiment and write its report",
         "up": "start a session: it waits for missions, until Ctrl-C or 'down'",
         "down": "end the session; it writes the report of its last mission",
         "mission": "start, steer and stop missions, here or in a cluster",
         "console": "show a flight in the browser, and steer it there",
         "ros": "show a flight to nodes of ROS 2, which may steer it",
-        "sweep": "fly a grid of settings with several seeds, on all cores",
-        "report": "write the report of a recorded run again",
         "replay": "watch a recorded flight in 3-D, in a browser",
-        "identify": "fit the model of the velocity loop to a recorded flight",
+        "report": "write the report of a recorded run again",
         "recover": "write a clean copy of a damaged recording",
-        "compare": "say whether a setting differs from another, and how sure that is",
-        "margin": "find the delay, or other value, up to which the loop is stable",
-        "place": "find out where the controller should run: robot, edge or cloud",
-        "measure": "measure how long a controller computes",
-        "capacity": "find how many robots a radio cell and a cloud carry",
-        "eval": "measure whether a policy survives a network",
-        "policy": "serve a policy that controls robots elsewhere",
-        "bench": "measure how fast the simulation runs here",
-        "faults": "inject faults and check that the system handles them",
-        "class": "hand out and score the exercise for students",
     },
-    "look around, set up": {
-        "list": "list experiments, profiles, predictors and more",
-        "new": "write the files of a robot of your own",
-        "robot": "check a robot: facts, a flight, and what must change",
-        "doctor": "check whether this machine can fly; say what to fix",
+    "links": {
         "link": "show, record, verify or change the emulated network",
         "relay": "carry TCP connections over the emulated network",
-        "key": "make or replace the key that world and cloud share",
-        "completion": "print a completion script for your shell",
     },
-    "processes (started by 'run --mode local')": {
+    "studies": {
+        "compare": "say whether a setting differs from another, and how sure that is",
+        "margin": "find the delay, or other value, up to which the loop is stable",
+        "sweep": "fly a grid of settings with several seeds, on all cores",
+        "capacity": "find how many robots a radio cell and a cloud carry",
+        "place": "find out where the controller should run: robot, edge or cloud",
+        "measure": "measure how long a controller computes",
+        "identify": "fit the model of the velocity loop to a recorded flight",
+        "faults": "inject faults and check that the system handles them",
+        "bench": "measure how fast the simulation runs here",
+    },
+    "policies": {
+        "eval": "measure whether a policy survives a network",
+        "policy": "serve a policy that controls robots elsewhere",
+    },
+    "cluster (a flight in real time here starts the last four, too)": {
+        "key": "make or replace the key that world and cloud share",
         "world": "the robot: physics, sensors, guard, low-level control",
         "cloud": "the remote controller",
         "teleop": "missions and the operator's HTTP API",
         "cell": "the radio cell that all robots of a fleet share",
+    },
+    "class": {
+        "class": "hand out and score the exercise for students",
+    },
+    "set up": {
+        "doctor": "check whether this machine can fly; say what to fix",
+        "list": "list experiments, profiles, predictors and more",
+        "new": "write the files of a robot of your own",
+        "robot": "check a robot: facts, a flight, and what must change",
+        "completion": "print a completion script for your shell",
     },
 }
 """Group of commands -> command -> help line. `cloudrc/cli/<command>.py` contains the command."""

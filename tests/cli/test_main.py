@@ -9,7 +9,7 @@ import pytest
 
 from cloudrc.cli.link import VERBS
 from cloudrc.cli.main import INTERNAL, main
-from cloudrc.cli.parser import COMMANDS
+from cloudrc.cli.parser import COMMANDS, GROUPS
 from cloudrc.errors import BadInputError
 from tests.support.commands import python
 
@@ -48,6 +48,7 @@ def test_help_fits_80_columns(command, capsys):
     assert max(map(len, text.splitlines())) <= 80
     if not command:
         assert all(name in text for name in COMMANDS)
+        assert list(GROUPS)[:4] == ["fly and steer", "links", "studies", "policies"]
         assert main([]) == 0, "no argument prints help, too"
         assert capsys.readouterr().out == text
 

@@ -18,6 +18,7 @@ from typing import Any
 import yaml
 from mcap.reader import make_reader
 
+from cloudrc.cli.parser import COMMANDS
 from tools.net.shell import cloudrc as call
 from tools.net.shell import document, stable
 
@@ -112,7 +113,7 @@ def helps() -> dict[str, str]:
     def read(*words: str) -> None:
         _, text, _ = call(*words, "--help")
         found[" ".join(words) or "cloudrc"] = text
-        for below in re.findall(r"^ {2,4}([a-z][\w-]*) {2,}", _listed(text), re.MULTILINE):
+        for below in _listed(text) if words else COMMANDS:
             if len(words) < 2:
                 read(*words, below)
 
@@ -120,12 +121,10 @@ def helps() -> dict[str, str]:
     return found
 
 
-def _listed(text: str) -> str:
-    """Return the part of a help that lists commands or verbs."""
-    if "verbs:" in text:
-        return text.partition("verbs:")[2].partition("\n\n")[0]
-    groups = re.findall(r"^(?:fly|look around|processes)[^\n]*:\n(.*?)\n\n", text, re.S | re.M)
-    return "\n".join(groups)
+def _listed(text: str) -> list[str]:
+    """Return the verbs that the help of a command lists."""
+    listed = text.partition("verbs:")[2].partition("\n\n")[0]
+    return re.findall(r"^ {2,4}([a-z][\w-]*) {2,}", listed, re.MULTILINE)
 
 
 def page(name: str) -> list[str]:
