@@ -37,11 +37,13 @@ CAPTION = (
     "percentile; red: the robot failed. Above the dashed line the guard holds a robot. "
 )
 WAITS = "Right: the longest wait of a packet in the cell, in each tenth of a second."
+LONG = 20
+"""Number of characters from which a text in a table may have several lines."""
 COLOURS = {"uplink": UPLINK, "downlink": DOWNLINK, "both": BLACK}
 BODY = Template("""<body>
 <header>
 <p class="kicker">$kicker</p>
-<h1>$headline</h1>
+<h1><span class="verdict">$verdict</span> $headline</h1>
 $notes
 </header>
 <main>
@@ -74,6 +76,7 @@ def write_fleet_page(folder: Path, flown: FleetFlown, document: Mapping[str, Any
     body = BODY.substitute(
         facts,
         kicker=escape(f"cloudrc fleet report · {name} · seed {experiment.seed}"),
+        verdict=escape(document["verdict"].upper()),
         headline=f"{document['succeeded']} of {count} robots succeeded.",
         notes="".join(f"<p>{escape(note[0].upper() + note[1:])}.</p>" for note in notes),
         figure=b64encode(_draw(flown, document)).decode(),
@@ -90,11 +93,20 @@ def write_fleet_page(folder: Path, flown: FleetFlown, document: Mapping[str, Any
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
     """Return a table as HTML; the first row has the heads."""
-    lines = ["".join(f'<td class="value">{escape(each)}</td>' for each in row) for row in rows[1:]]
+    lines = ["".join(map(_cell, row)) for row in rows[1:]]
     heads = "".join(f'<th style="text-align: right">{escape(each)}</th>' for each in rows[0])
     body = "\n".join(f"<tr>{line}</tr>" for line in lines)
     inner = f"<thead><tr>{heads}</tr></thead><tbody>{body}</tbody>"
     return f'<table style="margin-top: 2rem">{inner}</table>'
+
+
+def _cell(text: str) -> str:
+    """Return a cell of a table: a verdict has its colour, and a long text has several lines."""
+    shown, kind = escape(text), "value" if len(text) < LONG else "text"
+    if text in HEADLINES:
+        _, colour = HEADLINES[text]
+        shown = f'<span class="verdict" style="--accent: {colour}">{shown}</span>'
+    return f'<td class="{kind}">{shown}</td>'
 
 
 def _draw(flown: FleetFlown, document: Mapping[str, Any]) -> bytes:

@@ -47,11 +47,12 @@ def render(
     pictures: Sequence[Picture],
     environment: Mapping[str, Any],
     replay: str = "",
+    still: Picture | None = None,
 ) -> str:
     """Return the HTML of the page.
 
     `environment` is the content of environment.json, `replay` the HTML of the 3-D replay or of a
-    line that says why there is none.
+    line that says why there is none. Readers see `still` where the browser draws no 3-D.
     """
     run, experiment, verdict = assessment.run, assessment.experiment, assessment.verdict
     headline, accent = HEADLINES[verdict.outcome]
@@ -62,6 +63,7 @@ def render(
         title=escape(f"{experiment.name}: {verdict.outcome}"),
         accent=accent,
         kicker=escape(kicker),
+        verdict=escape(verdict.outcome.upper()),
         headline=escape(headline),
         summary=_pairs(
             {text: f"{n} {unit}".rstrip() for text, n, unit in main_numbers(assessment.numbers)}
@@ -70,6 +72,7 @@ def render(
         notes=_list([escape(note) for note in assessment.notes], "note"),
         facts=_facts(run, experiment, assessment.flight),
         replay=replay,
+        still=_still(still) if still else "",
         figures="\n".join(_figure(n, picture) for n, picture in enumerate(pictures, start=1)),
         numbers=_table_rows(assessment.numbers),
         repeat=escape(REPEAT[run.mode == "virtual"]),
@@ -116,6 +119,14 @@ def _failure(failure: FlightFailure) -> str:
 def _list(items: Sequence[str], name: str) -> str:
     rows = "".join(f"<li>{item}</li>" for item in items)
     return f'<ul class="{name}">{rows}</ul>' if items else ""
+
+
+def _still(picture: Picture) -> str:
+    source = f"data:image/png;base64,{b64encode(picture.files['png']).decode()}"
+    return (
+        f'<figure id="still"><img src="{source}" alt="{escape(picture.alt)}">\n'
+        f"<figcaption>{escape(picture.caption)}</figcaption></figure>"
+    )
 
 
 def _figure(number: int, picture: Picture) -> str:

@@ -165,7 +165,7 @@ def _draw(
     figures: bool,
 ) -> None:
     """Draw a run; write report.html, the files in figures/, or both."""
-    from cloudrc.report.figures import PAGE_KINDS, PRINT_KINDS, draw_all
+    from cloudrc.report.figures import PAGE_KINDS, PRINT_KINDS, draw_all, draw_still
     from cloudrc.report.figures.style import Look, Subject
     from cloudrc.report.page import render
 
@@ -182,7 +182,8 @@ def _draw(
             for kind, content in picture.files.items():
                 write_atomically(target / f"{picture.name}.{kind}", content)
     if page:
-        text = render(assessment, pictures, environment, _replay(assessment))
+        still = draw_still(subject) if len(assessment.flight.truth["position"]) else None
+        text = render(assessment, pictures, environment, _replay(assessment), still)
         write_atomically(folder / "report.html", text.encode("utf-8"))
 
 

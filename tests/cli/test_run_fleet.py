@@ -20,7 +20,9 @@ def test_a_fleet_is_told_as_tables_and_leaves_a_folder_for_each_robot(folder, ca
     heads = [line.split()[0] for line in lines if line]
     assert heads[2:10] == ["robot", "median", "worst", "0", "1", "2", "cell", "uplink"]
     assert lines[-1] == "fleet/report.html"
-    assert (folder / lines[-1]).read_text().count("<tr>") == 9
+    page = (folder / lines[-1]).read_text()
+    assert page.count("<tr>") == 9
+    assert page.count('class="verdict"') == 4, "of the fleet and of each robot"
     report = json.loads((folder / "fleet/report.json").read_text())
     assert report["succeeded"] == 3
     rows = [*csv.DictReader((folder / "fleet/cell.csv").read_text().splitlines())]

@@ -29,8 +29,8 @@ def page(tmp_path_factory):
 
 def test_the_page_fetches_nothing_and_describes_every_picture(page):
     pictures = re.findall(r"<img\b[^>]*>", page)
-    assert len(pictures) == 2
-    assert all('src="data:image/svg+xml;base64,' in picture for picture in pictures)
+    assert len(pictures) == 3, "two figures, and the still picture of the flight"
+    assert all('src="data:image/' in picture for picture in pictures)
     assert all(re.search(r'alt="[^"]{20,}"', picture) for picture in pictures)
     assert all(len(alt) >= 20 for _, _, alt in FIGURES.values())
     page = re.sub('<script type="application/json".*?</script>', "", page, flags=re.DOTALL)
@@ -42,7 +42,7 @@ def test_the_page_says_what_the_flight_did(page):
     text = re.sub(r"\s", " ", re.sub(r"<[^>]+>", "", page))
     experiment, recording = paper()
     for said in (
-        "The mission succeeded.",
+        "SUCCESS The mission succeeded.",
         "mission took31.14 s waypoints reached7",
         "first touch at27.87 s",
         "least clearance0.153 m",
@@ -70,7 +70,7 @@ def test_failures_and_notes_are_escaped():
     )
     picture = Picture("delay", {"svg": b"<svg/>"}, "Caption.", 7.16, "A picture of something.")
     page = render(assessment, [picture], environment_document())
-    assert "The mission failed." in page
+    assert '<span class="verdict">FAILURE</span> The mission failed.' in page
     assert "it hit, at 3.50 s, x 1.00, y -2.00, z 0.70 m <code>obstacle_touched</code>" in page
     assert "<script>" not in page
     assert "metric &lt;b&gt; &amp;" in page

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cloudrc.record import wall_time
-from cloudrc.report.figures import curves, flight, marks, tails
+from cloudrc.report.figures import curves, flight, marks, still, tails
 from cloudrc.report.figures.style import Look, Subject
 
 FIGURES: dict[str, tuple[Callable[[Subject], Figure], str, str]] = {
@@ -59,6 +59,13 @@ def draw_all(subject: Subject, kinds: Iterable[str] = PAGE_KINDS) -> list[Pictur
             text = caption + (marks.legend(subject) if panels else "")
             pictures.append(Picture(name, files, text, subject.look.width, alt, panels))
     return pictures
+
+
+def draw_still(subject: Subject) -> Picture:
+    """Draw the still picture of a flight, which has a true position."""
+    with own_settings(subject.look):
+        png = save(still.draw(subject), "png")
+    return Picture("still", {"png": png}, still.CAPTION, subject.look.width, still.ALT)
 
 
 def _lay_out(figure: Figure) -> None:

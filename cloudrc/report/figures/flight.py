@@ -5,6 +5,7 @@ A robot that stays on the ground has no panel from the side.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -62,16 +63,21 @@ def draw(subject: Subject) -> Figure:
 
 def _draw_view(axes: Axes, subject: Subject, sides: tuple[int, int]) -> ScalarMappable | None:
     """Draw path, waypoints and obstacles over two axes of the world, 0 to 2; return the path."""
-    for number, waypoint in enumerate(subject.flight.mission.waypoints, start=1):
-        x, y = (waypoint.position_m[side] for side in sides)
-        axes.plot(x, y, "o", ms=8, mfc="white", mec=BLACK, mew=0.8, zorder=5)
-        axes.text(x, y, str(number), size="x-small", ha="center", va="center", zorder=6)
+    points = [waypoint.position_m for waypoint in subject.flight.mission.waypoints]
+    draw_waypoints(axes, [[point[side] for side in sides] for point in points])
     _draw_obstacles(axes, subject, sides)
     path = _draw_path(axes, subject, subject.flight.truth["position"][:, sides])
     axes.margins(MARGIN)
     axes.set_xlabel(f"${'xyz'[sides[0]]}$ (m)")
     axes.set_ylabel(f"${'xyz'[sides[1]]}$ (m)")
     return path
+
+
+def draw_waypoints(axes: Axes, places: Iterable[Iterable[float]]) -> None:
+    """Draw a numbered circle for each waypoint, at its place in the panel."""
+    for number, (x, y) in enumerate(places, start=1):
+        axes.plot(x, y, "o", ms=8, mfc="white", mec=BLACK, mew=0.8, zorder=5)
+        axes.text(x, y, str(number), size="x-small", ha="center", va="center", zorder=6)
 
 
 def _draw_path(axes: Axes, subject: Subject, points: Array) -> ScalarMappable | None:
