@@ -253,7 +253,7 @@ def viser_at(path: str) -> Iterator[None]:
 
 
 def scene_page(viser: str, keys: Mapping[str, str]) -> str:
-    """Return viser's page with STOP and keys, which do not wait for viser.
+    """Return viser's page with STOP and keys, which do not wait for viser, and "loading".
 
     Args:
         viser: HTML of viser's page.
@@ -264,11 +264,11 @@ def scene_page(viser: str, keys: Mapping[str, str]) -> str:
     """
     style = _read("stop.css") + _read("scene.css")
     script = _read("stop.js") + _read("scene.js").replace("KEYS", json.dumps(keys))
-    root = '<div id="root">'
+    root, first = '<div id="root">', _read("stop.html") + _read("loading.html")
     parts = {
         "<title>Viser</title>": "<title>cloudrc</title>",
         "</head>": f"<style>{style}</style></head>",
-        root: f"{_read('stop.html')}<script>(() => {{{script}}})();</script>{root}",
+        root: f"{first}<script>(() => {{{script}}})();</script>{root}",
     }
     for old, new in parts.items():
         if viser.count(old) != 1:

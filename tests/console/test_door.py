@@ -135,6 +135,32 @@ def test_a_page_without_a_place_and_one_without_webgl_become_plain(page, browse,
     late.wait_for_url("**/plain")
 
 
+WATCH = """
+const find = name => [...document.querySelectorAll('button')].find(one => one.innerText === name);
+const look = () => {
+  const middle = document.elementFromPoint(innerWidth / 2, innerHeight / 2);
+  if (find('STOP')) {
+    window.seen ??= new Set();
+    window.seen.add(middle.id === 'loading' ? 'loading' : find('Hold') ? 'ready' : 'viser');
+  }
+  requestAnimationFrame(look);
+};
+look();
+"""
+"""Notes for each frame of a page what it shows."""
+
+
+@pytest.mark.process
+def test_a_slow_browser_says_loading_and_never_shows_the_panel_of_viser(page, browse):
+    opened = browse(page.url.replace("/?", "/plain?"))
+    opened.set_default_timeout(LIMIT * 1e3)
+    opened.context.new_cdp_session(opened).send("Emulation.setCPUThrottlingRate", {"rate": 6})
+    opened.add_init_script(WATCH)
+    opened.goto(f"{page.url}&fixedDpr=0.25", wait_until="commit")
+    opened.wait_for_function("window.seen?.has('ready')")
+    assert opened.evaluate("[...window.seen]") == ["loading", "ready"]
+
+
 @pytest.mark.process
 @pytest.mark.parametrize(
     ("key", "code"), [("X", "KeyX"), ("x", "KeyX"), ("X", "KeyB"), ("Q", "KeyX"), ("Ч", "KeyX")]

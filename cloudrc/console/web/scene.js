@@ -4,15 +4,21 @@ if (!document.createElement('canvas').getContext('webgl2')) {
 
 // viser's page waits for ever if the door has no place for one more page with the scene.
 const looking = setInterval(async () => {
-  if (document.querySelector('#root [role=tab]')) {
-    clearInterval(looking);  // viser's panels: this page has a place
-    return;
-  }
   const state = await fetch(`${place}state`).then(answer => answer.json()).catch(() => null);
   if (state?.is_full) {
     location.replace(`${place}plain`);
   }
 }, 2000);
+
+// Until the panels of the flight are there, viser shows a panel of its own: "loading" covers it.
+const waiting = setInterval(() => {
+  const panels = document.querySelector('#root:has([role=tab])');
+  if (panels && (find('Hold') || panels.textContent.includes('Read only'))) {
+    clearInterval(looking);
+    clearInterval(waiting);
+    document.getElementById('loading').remove();
+  }
+}, 100);
 
 // viser's buttons tell that they are held, its keys do not: a held key holds the button of its name.
 const drive = KEYS;
