@@ -1,6 +1,6 @@
 """A task without weights on which a policy's answers disagree: pass poles on the left or right.
 
-    python examples/fork.py [EPISODES]     # the table of docs/gym.md
+    python examples/fork.py [EPISODES]     # the table of docs/executors.md
 
 The policy draws the side anew for each answer, as a generative policy with two modes does. An
 executor that mixes answers steers between both sides, into the pole. With `rtc`, the policy sees

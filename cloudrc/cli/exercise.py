@@ -39,7 +39,7 @@ EPILOG = """\
 examples:
   cloudrc class new exercise        three files to fill in
   cloudrc class check exercise      the points of each part
-  cloudrc class new TASK.yaml       a task of your own, see docs/exercise.md
+  cloudrc class new TASK.yaml       a task of your own, see docs/class.md
   cloudrc class check hand-ins/* --task TASK.yaml > points.csv
   cloudrc class check hand-ins/* --task TASK.yaml --resume points.csv
   cloudrc class check /autograder/submission -o gradescope > results.json

@@ -26,8 +26,8 @@ examples:
 It needs a ROS 2 with rclpy for this Python. It publishes odom, /tf,
 robot_description, cloudrc/mission, guard, scene, path and /diagnostics, takes
 goal_pose and cmd_vel, and serves navigate_to_pose and cloudrc/hold, resume,
-cancel, estop and acknowledge. It ends with the flight. docs/ros2.md describes
-the topics."""
+cancel, estop and acknowledge. It ends with the flight:
+docs/ros2-bridge.md describes the topics."""
 
 
 def arguments(parser: Parser) -> None:

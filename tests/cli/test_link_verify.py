@@ -111,6 +111,6 @@ def test_what_is_not_judged_is_noted(release):
     release.tells("time_line", 1.0)
     said = release.ask(0.0)
     assert said["verdict"] == "undecided"
-    assert "uplink: time_line NOT JUDGED; docs/link.md says why" in as_text(said)
+    assert "uplink: time_line NOT JUDGED; docs/verify.md says why" in as_text(said)
     release.hears(cloud="ok")
     assert as_text(release.ask()).endswith("except what is NOT JUDGED (above)")

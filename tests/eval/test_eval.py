@@ -1,7 +1,6 @@
 """Evaluations: episodes over a link, their rows, tables and pages."""
 
 import json
-import shlex
 from hashlib import sha256
 from itertools import count
 from pathlib import Path
@@ -248,21 +247,9 @@ def test_a_server_that_fails_keeps_the_rows_and_is_one_line(tmp_path, evaluate, 
     assert len((tmp_path / "e" / "rows.jsonl").read_text().splitlines()) > 2
 
 
-def test_the_policy_of_the_documentation_stands_where_the_table_says(law, tmp_path):
-    path = law(blocks("eval", "python")[0])
+def test_the_policy_of_the_tutorial_stands_where_its_table_says(law, tmp_path):
+    path = law(blocks("tutorials/policy", "python")[1])
     setup = EvalSetup("CartPole-v1", path, link="lte", success_at=500)
     names = ("newest", "time-indexed", "broker")
     verdicts = [play(Episode(100.0, name, 1), setup)["verdict"] for name in names]
     assert verdicts == ["failure", "success", "failure"]
-
-
-@pytest.mark.full
-def test_the_command_of_the_documentation_prints_its_table(law, tmp_path, call, monkeypatch):
-    law(blocks("eval", "python")[0])
-    monkeypatch.chdir(tmp_path)
-    command = next(each for each in blocks("eval", "bash") if each.startswith("cloudrc eval"))
-    said = call("", *shlex.split(command.replace("\\\n", " "))[1:])
-    table = blocks("eval", "text")[0].strip().splitlines()
-    assert table.pop(0) in said.err.splitlines()  # about the work, before it
-    printed = iter(said.out.splitlines())  # in this order; "..." stands for lines between them
-    assert [line for line in table if line != "..." and line not in printed] == []

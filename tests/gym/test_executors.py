@@ -153,7 +153,7 @@ def test_every_executor_says_what_it_is_and_forgets_the_last_episode(name):
 def test_an_executor_corrects_actions_with_the_newest_observation(tmp_path):
     """The chunks stand still; the example of the page damps what it sees on board."""
     (tmp_path / "corrected.py").write_text(
-        next(each for each in blocks("gym", "python") if "Corrected" in each)
+        next(each for each in blocks("plugins-executor", "python") if "Corrected" in each)
     )
     executed, speeds = [], []
     for link in ("ideal", "lte"):

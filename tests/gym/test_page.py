@@ -1,8 +1,11 @@
-"""The examples of docs/gym.md run."""
+"""The examples of docs/gym.md and of docs/train.md run."""
+
+import pytest
 
 from tests.support.pages import run_page
 
 
-def test_the_examples_of_the_page_run(tmp_path, capsys):
-    run_page("gym", tmp_path)
-    assert "delay_measured" in capsys.readouterr().out
+@pytest.mark.parametrize(("page", "printed"), [("gym", "delay_measured"), ("train", "actions")])
+def test_the_examples_of_a_page_run(tmp_path, capsys, page, printed):
+    run_page(page, tmp_path)
+    assert printed in capsys.readouterr().out

@@ -1,6 +1,6 @@
 """Controller: a node of ROS 2, which answers each estimate with a velocity.
 
-Source: docs/ros2.md, "The topics".
+Source: docs/reference/ros2.md.
 """
 
 from __future__ import annotations

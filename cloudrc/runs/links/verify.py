@@ -217,7 +217,7 @@ def _notes(way: str, rows: Sequence[Judgement]) -> Iterator[str]:
         yield f"{way}: one-way delays {NOT_JUDGED}: the ends do not share a clock"
     for row in rows:
         if row.verdict == "told":
-            yield f"{way}: {row.name} {NOT_JUDGED}; docs/link.md says why"
+            yield f"{way}: {row.name} {NOT_JUDGED}; docs/verify.md says why"
 
 
 def make_report(title: str, findings: Mapping[str, Findings]) -> Report:
