@@ -3,7 +3,8 @@
 The tables of docs/experiment.md come from the models in `cloudrc/config/schema.py` and from the
 signatures of the shipped plug-ins. The tables of docs/topics.md come from
 `cloudrc/record/topics.py`, those of docs/metrics.md from `cloudrc/exposition/table.py`. The text
-around the tables is written by hand. `QUANTITIES` gives panels to the dashboard of missions.
+around the tables is written by hand. `QUANTITIES` gives panels to the dashboard of missions. The
+table of docs/on-call.md comes from the chart's `files/rules.yaml`.
 
 The chart's schema and table come from its `values.yaml`. Shipped profiles and missions are copied,
 because a chart can read only its own files.
@@ -123,6 +124,7 @@ def outputs() -> dict[Path, str]:
         **insert(ROOT / "docs" / "experiment.md", _experiment()),
         **insert(ROOT / "docs" / "topics.md", _topics()),
         **insert(ROOT / "docs" / "metrics.md", _metrics()),
+        **insert(ROOT / "docs" / "on-call.md", f"\n{_alerts()}"),
         **insert(CHART / "README.md", f"\n{rows}"),
         **insert(CHART / "files" / "dashboards" / "missions.yaml", f"{panels(QUANTITIES)}# "),
         CHART / "values.schema.json": json.dumps(make_schema(values), indent=2) + "\n",
@@ -177,6 +179,18 @@ def _experiment() -> str:
     blocks += ["## One direction of a link\n", _summary(DirectionConfig), _keys(DirectionConfig)]
     blocks += ["How each key acts: [link.md](link.md).\n", "## Shipped files\n", _shipped()]
     return "\n".join(blocks)
+
+
+def _alerts() -> str:
+    """Format the table of alerts; the first sentence of a description is the first action."""
+    groups = yaml.safe_load((CHART / "files" / "rules.yaml").read_text())["groups"]
+    rows: list[tuple[str, ...]] = []
+    for rule in (rule for group in groups for rule in group["rules"] if "alert" in rule):
+        name, told = rule["alert"], rule["annotations"]
+        texts = told["summary"].rstrip("."), told["description"].partition(". ")[0].rstrip(".")
+        commands = (re.sub(r"(?<=[ (])'([^']+)'", r"`\1`", text) for text in texts)
+        rows.append((f"[{name}](#{name.lower()})", *commands))
+    return table("alert | meaning | first action", rows)
 
 
 def panels(quantities: Iterable[RecordQuantity]) -> str:
