@@ -24,7 +24,7 @@ examples:
     cloud.predictor=constant_velocity,cloud.estimator=split --number iae_mean
   cloudrc compare cloud.estimator=running_mean cloud.estimator=split \\
     --set link.profile=handover --number delay_estimate_error_rms
-  cloudrc compare last_sample constant_velocity --in runs/sweep-steps-1"""
+  cloudrc compare constant_velocity constant_acceleration --in runs/sweep-grid-1"""
 
 
 def arguments(parser: Parser) -> None:

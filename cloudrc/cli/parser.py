@@ -91,8 +91,9 @@ examples:
   cloudrc run --help                   every command has its own help
 
 exit codes: 0 done, 1 mission failed its criteria, 2 usage or bad input,
-  3 missing prerequisite, 4 timeout, 5 cluster or API error,
-  6 run invalid (not real time), 70 internal error, 130 interrupted"""
+  3 missing prerequisite, 4 timeout, 5 cluster, API, outside controller
+  or policy failed, 6 run invalid (not real time, a process died),
+  70 internal error, 130 interrupted"""
 
 
 Settings = TypeVar("Settings")

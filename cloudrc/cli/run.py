@@ -68,7 +68,7 @@ def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     many = parser.add_mutually_exclusive_group()
     experiment_arguments(parser, many)
-    about = "where to fly (default: local; with --seeds: virtual)"
+    about = "where to fly (default: local; with --seeds or a fleet: virtual)"
     add = flags(parser)
     add("--mode", None, about, choices=MODES)
     flags(many)("--seeds", "N", "fly seeds 1 to N on all cores and print a table", read=read_count)
