@@ -54,7 +54,7 @@ class Result:
     """
 
     verdict: str  # "success", "failure", or "interrupted" if nothing ended the mission
-    failures: tuple[FlightFailure, ...]  # code, text, time [s], place [m]; see docs/method.md
+    failures: tuple[FlightFailure, ...]  # code, text, time [s], place [m]; see docs/verdict.md
     numbers: dict[str, float]  # metric -> value; a number that cannot be known is absent
     units: dict[str, str]  # metric -> SI unit; "1" for counts and shares
     notes: tuple[str, ...]  # sentences for the reader

@@ -78,7 +78,7 @@ class LinkChecked(NamedTuple):
 
 REAL_TIME_FACTOR_MIN = 0.95
 """Lowest real-time factor of a valid run in real time.
-Source: docs/reference/control.md, "Real-time factor"."""
+Source: docs/verdict.md, "Real-time factor"."""
 
 
 class TelemetrySent(NamedTuple):

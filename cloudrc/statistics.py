@@ -1,6 +1,6 @@
 """Compute medians, paired differences and success rates, with exact intervals and tests.
 
-No function uses random numbers. docs/compare.md explains the choice of the methods.
+No function uses random numbers. docs/method.md explains the choice of the methods.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ PAGES = (
     "docs/plugins.md",
     "docs/plugins-predictor.md",
     "docs/plugins-controller.md",
+    "docs/plugins-metric.md",
     "docs/scene.md",
 )
 TEXT = "\n".join((ROOT / page).read_text() for page in PAGES)

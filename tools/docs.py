@@ -353,7 +353,7 @@ def _metrics() -> str:
         for metric in METRICS.values()
         if metric.buckets
     ]
-    head = "## Buckets\n\nUpper bounds of the buckets of each histogram [s]:\n"
+    head = "## Buckets\n\nUpper bounds of the buckets of each histogram [s]:\n\n"
     return f"\n{table('metric | type | from | meaning', rows)}\n{head}{''.join(buckets)}"
 
 

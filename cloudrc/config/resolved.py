@@ -30,13 +30,13 @@ from cloudrc.outside.document import write_yaml
 HORIZON_MAX_S = 1.0
 """Default of cloud.horizon_max_s [s]. Source: docs/reference/control.md, "Predictors"."""
 FREEZE_AFTER_S = 0.4
-"""Default of cloud.freeze_after_s [s]. Source: docs/reference/plant.md, "Frozen reference"."""
+"""Default of cloud.freeze_after_s [s]. Source: docs/safety.md, "Frozen reference"."""
 COMMAND_AGE_MAX_MS = 250.0
 """Default of guard.command_age_max_ms if experiment and link profile give no value [ms].
-Source: docs/reference/plant.md, "Command age"."""
+Source: docs/safety.md, "States"."""
 PLAN_MAX_S = 0.8
 """Default of guard.plan_max_s if cloud sends plans [s].
-Source: docs/reference/plant.md, "Plan"."""
+Source: docs/safety.md, "States"."""
 
 
 class Bounds(NamedTuple):
@@ -53,7 +53,7 @@ def speed_cap(command_age_max_ms: float, plan_max_s: float, bounds: Bounds) -> f
     and brakes at a, its `braking_mps2`: v · (T + 0.2 s) + v^2 / (2a) = room. T is the largest age
     of a command, `command_age_max_ms` [ms], plus the longest plan, `plan_max_s` [s]. The cap is
     lower for a robot that cannot follow this speed.
-    Source: docs/reference/plant.md, "Speed cap".
+    Source: docs/safety.md, "Speed cap".
     """
     robot, room = bounds.robot, max(bounds.room, 0.0)
     delay, braking = command_age_max_ms * 1e-3 + plan_max_s + 0.2, robot.braking_mps2

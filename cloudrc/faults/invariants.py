@@ -22,10 +22,10 @@ hold       At least `SETTLE_NS` pass between two changes to TRACK. In a mission,
 order      Each applied command is newer than the last one, and not of an old session.
 tick       The guard runs once in each step of the physics.
 
-All limits come from configuration, robot and docs/, not from the guard: from "Stop rule" and
-"Leaving HOLD" in reference/plant.md, F5 and F23 in reference/faults.md, and "The guard" in
-safety.md. `observer` checks, during the flight, commands that world accepts and changes of the
-guard's state (stale, latch and hold). This module checks all else in the rows that it has kept.
+All limits come from configuration, robot and docs/, not from the guard: from "The guard" in
+safety.md, and F5 and F23 of `cloudrc faults list`. `observer` checks, during the flight, commands
+that world accepts and changes of the guard's state (stale, latch and hold). This module checks all
+else in the rows that it has kept.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def _fence(steps: FlightSteps) -> Broken:
 def _stop_distance(speed: Array, rules: Rules) -> Array:
     """Return the way from `speed` [m/s] to rest [m].
 
-    Source: docs/reference/plant.md, "Stop rule".
+    Source: docs/safety.md, "Stop rule".
     """
     distance: Array = speed * (REACTION + speed / (2.0 * rules.braking))
     return distance

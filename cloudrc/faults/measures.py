@@ -157,7 +157,7 @@ Inject: TypeAlias = Callable[[Outcome], None]
 class Scenario:
     """A fault, how to inject it, and the reaction that the robot has to show."""
 
-    number: int  # in docs/reference/faults.md: 13 for F13
+    number: int  # 13 for F13
     name: str  # on the command line: cloud-killed
     injects: str
     expects: str  # what the robot does, and within what time

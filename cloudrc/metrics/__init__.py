@@ -2,5 +2,5 @@
 
 `measure` finds and computes metrics; the metrics of cloudrc are rows of tables in `flight`,
 `control`, `link` and `mission`. `definitions` has the quantities that live metrics, console and
-report share. docs/plugins.md explains how to add your own metrics.
+report share. docs/plugins-metric.md explains how to add your own metrics.
 """

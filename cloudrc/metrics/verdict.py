@@ -50,7 +50,7 @@ SLIP_MAX = 0.25
 """Largest time that world's clock may lose in a valid flight [s]: the guard's default limit on the
 age of a command. With a larger loss, the guard might react to a slow machine."""
 EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
-"""Exit code of each outcome. Source: docs/reference/control.md, "Exit codes"."""
+"""Exit code of each outcome. Source: docs/trouble.md, "What the exit code says"."""
 PLUGIN_FAILURES_MAX = 0.01
 """Largest share of periods in which a plug-in may fail in a valid flight, in [0, 1]."""
 BROKEN_OFF = ("interrupted", "cancelled", "disk_full")

@@ -39,7 +39,7 @@ GROWTH = 2
 """Growth of the fleet from one size to the next, until one fails [1]."""
 RESUME_HZ = 20.0
 """Rate of commands below which a HOLD does not end [1/s].
-Source: docs/reference/plant.md, "Leaving HOLD": 10 commands within 500 ms."""
+Source: docs/safety.md, "Leaving HOLD": 10 commands within 500 ms."""
 CLOSE = 0.9
 """Share of a limit from which on a number counts as near it [1]."""
 

@@ -38,7 +38,7 @@ ENDS_IN = 2.0
 """Time limit for a deleted pod to end, and for its robot to hold [s].
 Source: docs/reference/faults.md, "F33"."""
 COMMANDS_IN = 2.0
-"""Time limit for a new cloud to send commands [s]. Source: docs/reference/faults.md, "F13"."""
+"""Time limit for a new cloud to send commands [s]. Source: `cloudrc faults list`, "F13"."""
 POD_START = 10.0
 """Time that Kubernetes needs to replace a pod whose image is on the node [s]. On kind with two busy
 CPUs, 6.3 to 9.5 s were measured from the pod's deletion to the flight."""

@@ -1,4 +1,4 @@
-"""Every promise in docs/safety.md has a test, and every promise mark names a promise there."""
+"""Every promise in docs/promises.md has a test, and every promise mark names a promise there."""
 
 import re
 from pathlib import Path
@@ -8,7 +8,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def test_promises_and_their_marks_match():
     tests = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py"))
-    page = (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "promises.md").read_text(encoding="utf-8")
     table = page.partition("\n## Promises\n")[2].partition("\n## ")[0]
     names = re.findall(r"^\| `([a-z-]+)` \|", table, re.MULTILINE)
     assert len(names) == len(set(names)) > 0

@@ -33,7 +33,7 @@ def velocity_loop(axis, s):
     weight of the arm saturates the integral, so that y, with the integral, is nearer to the limit.
     The closed loop is G = L / (1 + L), L = C A / (m s + c).
 
-    Source: docs/reference/plant.md, "Low-level controller".
+    Source: docs/reference/onboard.md.
     """
     rotors = 1.0 / (1.0 + LAG * s)
     if axis == "z":

@@ -1,7 +1,8 @@
 """Delay estimator: the exponentially weighted moving average of the loop delay.
 
-Source: docs/reference/control.md, "Delay estimators": with a gain of 0.05, the RMS error at a step
-of the delay is a third of that of eq. (1) of the paper. At a constant delay, both errors are equal.
+With a gain of 0.05, the RMS error at a step of the delay is a third of that of eq. (1) of the
+paper. At a constant delay, both errors are equal.
+Source: docs/reference/control.md, "Delay estimators".
 """
 
 from __future__ import annotations

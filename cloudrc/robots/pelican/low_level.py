@@ -4,7 +4,7 @@ A velocity PID computes the force that the robot needs. Geometric attitude contr
 axis towards this force. The allocation distributes thrust and torque over the four rotors. Vectors
 are tuples of floats, because arrays would be too slow in every physics step.
 
-Source: docs/reference/plant.md, "Low-level controller".
+Source: docs/reference/onboard.md.
 Deviation: the published code assumes a step of 10 ms but runs every 2 ms. This module uses the true
 step; its gains are converted so that the effect is the same.
 """

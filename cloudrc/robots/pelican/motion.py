@@ -6,8 +6,8 @@ them from the commands that the echoes confirm. Each odometry sample replaces th
 twist. The model estimates effects that it lacks, such as wind, a payload or the arm's weight, as a
 constant acceleration and a constant torque.
 
-Source: docs/reference/control.md, "Predictors", (e2); docs/reference/plant.md, "Robot", "Low-level
-controller".
+Source: docs/reference/control.md, "Predictors", (e2); docs/reference/plant.md, "Robot", and
+docs/reference/onboard.md.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class WhiteBox(Body):
     ) -> Vector:
         """Compute the force that the onboard PID requests [N]; advance its integral by `h` [s].
 
-        `last` is the previous reference. Source: docs/reference/plant.md, "Low-level controller".
+        `last` is the previous reference. Source: docs/reference/onboard.md.
         """
         px, py, pz, ix, iy, iz, dx, dy, dz, limit_x, limit_y, limit_z = self._gains
         (rx, ry, rz), (vx, vy, vz), (ax, ay, az) = reference, velocity, acceleration

@@ -28,7 +28,7 @@ least BRAKE_SHARE_MIN times the robot's speed."""
 STILL_SPEED = 0.1
 """Speed below which the robot counts as at rest [m/s]."""
 LAND_SPEED = 0.5
-"""Speed of the descent [m/s]. Source: docs/reference/plant.md, "Landing"."""
+"""Speed of the descent [m/s]. Source: docs/safety.md, "States"."""
 STILL_SHARE = 0.2
 """A descending robot counts as at rest if it is slower than STILL_SPEED, and slower than this share
 of the planned speed. With a low speed cap, the planned speed itself may be below STILL_SPEED."""

@@ -17,14 +17,14 @@ from cloudrc.messages import ZERO, Vector
 
 REACTION = 0.2
 """Time from the start of braking until the robot decelerates as its robot.yaml promises [s].
-Source: docs/reference/plant.md, "Stop rule"."""
+Source: docs/safety.md, "Stop rule"."""
 FENCE_REACTION = 0.6
 """Reaction time in the stop rule at the walls and the ceiling of the fence [s]. With the braking a
 of the robot, the guard limits the speed v so that
 FENCE_REACTION · v + v^2/(2a) <= distance - WALL_MARGIN. At the floor the guard uses REACTION and
 FLOOR_MARGIN, because the robot can stop a descent quickly.
-Deviation: docs/reference/plant.md, "Stop rule", has 0.2 s and 0.1 m. With 0.2 s and 0.1 m a hostile
-cloud can move the robot 0.3 m beyond the fence, because the robot reacts with a delay."""
+With REACTION and 0.1 m at the walls, too, a hostile cloud can move the robot 0.3 m beyond the
+fence, because the robot reacts with a delay. Source: docs/safety.md, "Stop rule"."""
 FAR = 1e6
 """Distance from a face of the fence beyond which the face limits no speed [m]."""
 RETURN_GAIN, RETURN_SPEED_MAX = 1.0, 0.5
@@ -164,7 +164,7 @@ RAMP_MIN = 1.0
 COMMAND_MAX = 1000.0
 """Largest component of a command that the guard accepts [m/s, rad/s]. A command with a larger
 component comes from a bug, so its direction cannot be trusted either.
-Source: docs/reference/faults.md, "F23"."""
+Source: `cloudrc faults list`, "F23"."""
 
 
 def ramp_ns(speed_max: float, braking: float) -> int:
@@ -173,6 +173,6 @@ def ramp_ns(speed_max: float, braking: float) -> int:
     In this time the robot can reach its highest speed, `speed_max` [m/s]; `braking` is in [m/s^2].
     The limit does not end earlier when the reference reaches the command, because the first
     commands after a silence may be zero.
-    Source: docs/reference/plant.md, "Leaving HOLD".
+    Source: docs/safety.md, "Leaving HOLD".
     """
     return round(max(RAMP_MIN, speed_max / braking) * 1e9)
