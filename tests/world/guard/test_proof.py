@@ -1,7 +1,6 @@
 """Proofs of the guard's arithmetic for all 64-bit floats, NaN and infinity included."""
 
 import pytest
-import z3
 
 from cloudrc.messages import Command
 from cloudrc.world.guard import hold
@@ -10,7 +9,8 @@ from cloudrc.world.guard.limits import COMMAND_MAX
 from cloudrc.world.guard.state import Guard
 from tests.conftest import nightly
 from tests.fences import FENCE
-from tests.world.guard.conftest import LIMITS, everywhere, root
+from tests.world.guard.conftest import LIMITS
+from tests.world.guard.proof import everywhere, root, z3
 
 
 @pytest.fixture(autouse=True)
