@@ -53,7 +53,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo live live-flight test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-cell results docs site dist owner images kind-load lock clean
+.PHONY: help demo live live-flight test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly viser lint types api audit bench bench-cell results docs site dist owner images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -204,6 +204,13 @@ $(EVIDENCE)/delayed-cartpole.md:
 	rm -rf build/sb3 && $(PYTHON) -m venv build/sb3
 	build/sb3/bin/pip install --quiet '.[gym]' stable-baselines3
 	build/sb3/bin/python examples/delayed_cartpole.py > $@
+
+# Beside, not in the environment: a clone keeps its viser.
+CONSOLE_TESTS = tests/console tests/report/test_replay.py -m 'not full'
+viser: $(VENV)/dev ## test console and replay on the locked viser, and on the newest one
+	for viser in "$$(grep -o '^viser==[0-9.]*' tests/requirements.txt)" viser; do \
+		rm -rf build/viser && $(bin)/python -m pip install --quiet --no-deps --target build/viser "$$viser" \
+		&& ls -d build/viser/viser-*.dist-info && PYTHONPATH=build/viser $(bin)/pytest $(CONSOLE_TESTS) || exit 1; done
 
 .PHONY: night-tun night-ros2 night-netem
 night-tun:
