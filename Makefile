@@ -228,6 +228,8 @@ lint: $(VENV)/dev ## check format and rules
 	$(bin)/ruff format --check .
 	$(bin)/ruff check .
 	$(bin)/lint-imports
+	$(bin)/codespell
+	$(bin)/zizmor --offline --quiet --min-severity medium .github
 	$(bin)/hadolint images/*/Dockerfile
 	$(bin)/shellcheck $(SCRIPTS)
 	@if command -v actionlint >/dev/null; then actionlint -ignore SC1090; \
