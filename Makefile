@@ -6,8 +6,8 @@ bin := $(VENV)/bin
 VERSION := $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' cloudrc/version.py)
 # Prefix of the images' names, with a slash at the end: make images REGISTRY=ghcr.io/me/
 REGISTRY ?=
-# Base image, if not that of the Dockerfiles: BASE=python:3.11-slim-bookworm@sha256:...
-BASE :=
+# Base image, if not that of the Dockerfiles, which name theirs by digest: BASE=registry.example/python:3.11-slim-bookworm.
+BASE ?=
 CLUSTER ?= cloudrc
 # For ROS 2 in the cluster also cloud-ros: IMAGES=cloud-ros, and ROS=kilted for another distribution.
 IMAGES := world cloud

@@ -56,6 +56,16 @@ def test_every_package_has_a_hash_and_no_address(lock):
     assert "://" not in text
 
 
+@pytest.mark.parametrize("role", ["cloud", "cloud-ros", "prometheus", "world"])
+def test_a_base_image_is_a_stage_or_has_a_digest(role):
+    text = (ROOT / "images" / role / "Dockerfile").read_text()
+    stages = re.findall(r"^FROM \S+ AS (\S+)$", text, re.MULTILINE)
+    bases = re.findall(r"^FROM (\S+)", text, re.MULTILINE)
+    pinned = [base for base in bases if re.fullmatch(r"\S+@sha256:[0-9a-f]{64}", base)]
+    assert pinned
+    assert {*bases} - {*pinned} <= {"${BASE}", *stages}
+
+
 LOG = """#!/bin/sh
 case "$*" in *clusters*) echo cloudrc ;; *) echo $* >> log ;; esac
 """
