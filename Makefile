@@ -278,12 +278,14 @@ dist: $(VENV)/dev ## build wheel, sdist and chart into dist/; needs helm
 	SOURCE_DATE_EPOCH=$(EPOCH) $(bin)/python -m hatchling build -d dist -t wheel -t sdist
 	$(bin)/python -m tools.pack_chart dist $(EPOCH)
 
-# The account that publishes; docs/install.md says where it stands.
+# Where the account that publishes stands; `make docs` copies it from CITATION.cff. The workflow `release` asks for it.
+OWNED := docs charts/cloudrc/README.md charts/cloudrc/Chart.yaml CITATION.cff .github/CODEOWNERS .github/ISSUE_TEMPLATE
 owner: $(VENV)/dev ## write the account that publishes into pages, badges and links of alerts: make owner OWNER=me
 	@test '$(OWNER)' || { echo "name the account: make owner OWNER=me" >&2; exit 2; }
-	grep -rlw OWNER docs charts/cloudrc/README.md | xargs sed -i 's/\bOWNER\b/$(OWNER)/g'
+	grep -rlw OWNER $(OWNED) | xargs sed -i 's/\bOWNER\b/$(OWNER)/g'
 	sed -i 's|^  runbooks: ""|  runbooks: https://$(OWNER).github.io/cloudrc|' charts/cloudrc/values.yaml
 	$(bin)/python -m tools.docs
+	@echo 'The authors are in CITATION.cff: name them there, then run make docs.'
 
 images: ## build the container images; needs Docker
 	@command -v docker >/dev/null || { \

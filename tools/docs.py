@@ -33,6 +33,7 @@ from cloudrc.exposition.table import METRICS, ROLES
 from cloudrc.metrics.definitions import QUANTITIES, RecordQuantity
 from cloudrc.outside.values import to_plain
 from cloudrc.record.topics import TOPICS
+from tools import metadata
 from tools.chart_values import added, earliest, make_schema, table_rows
 from tools.dashboards import UNITS
 
@@ -121,6 +122,7 @@ def outputs() -> dict[Path, str]:
     rows = table("key | default | meaning", table_rows(values))
     new = added(yaml.safe_load(values), earliest())
     return {
+        **metadata.outputs(),
         **insert(ROOT / "docs" / "experiment.md", _experiment()),
         **insert(ROOT / "docs" / "topics.md", _topics()),
         **insert(ROOT / "docs" / "metrics.md", _metrics()),
