@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.record.topics import TOPICS
+from tests.support.commands import python
 from tools import docs
 from tools.site import dead_links, relinked, site_name
 
@@ -46,6 +47,19 @@ def test_every_file_in_the_architecture_exists():
     assert named
     for name in named:
         assert any(ROOT.glob(name)) or any(ROOT.glob(f"cloudrc/{name}")), name
+
+
+def test_the_tour_names_what_exists_and_follows_a_packet():
+    page = (ROOT / "CONTRIBUTING.md").read_text()
+    stops = re.findall(r"^\| \d+ \| `([\w/]+\.py)`: (.+?) \|", page, re.MULTILINE)
+    assert len(stops) == 10
+    for file, names in stops:
+        text = (ROOT / "cloudrc" / file).read_text()
+        for name in re.findall(r"(\w+)`", names):
+            assert re.search(rf"\bdef {name}\(|^{name} = ", text, re.MULTILINE), (file, name)
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    said = re.findall(r": (\S+) ms after", python("-c", block, check=True).stdout)
+    assert 0.0 < float(said[0]) < float(said[1]) < float(said[2])
 
 
 def test_the_list_of_pages_names_every_page():
