@@ -53,7 +53,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo live live-flight test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly viser lint types api audit bench bench-cell results docs site dist owner images kind-load lock clean
+.PHONY: help demo live live-flight test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly viser lint spdx types api audit bench bench-cell results docs site dist owner images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -236,6 +236,14 @@ lint: $(VENV)/dev ## check format and rules
 		else echo "no actionlint here: the workflows are not checked"; fi
 	@if command -v helm >/dev/null; then helm lint --quiet --strict --kube-version 1.29.0 charts/cloudrc; \
 		else echo "no helm here: the chart is checked by 'make test' alone"; fi
+
+# Sources that name their licence, beside SCRIPTS. REUSE.toml speaks for all other files, and for those of one byte.
+LICENSED = git ls-files -z -- '*.py' '*.c' '*.js' '*.css' Makefile 'images/*/Dockerfile' '.github/**.y*ml' \
+	':!tests/fixtures' ':!tools/net/own' | xargs -0 sh -c 'find "$$@" -size +1c -print0' find
+spdx: $(VENV)/dev ## write the line of the licence into new sources (with the tool of REUSE)
+	$(bin)/python -m pip install --quiet 'reuse>=6'
+	$(LICENSED) | xargs -0 $(bin)/reuse annotate --license Apache-2.0 --skip-existing
+	$(bin)/reuse annotate --license Apache-2.0 --skip-existing --style python $(SCRIPTS)
 
 AUDIT := $(bin)/pip-audit --require-hashes --disable-pip --progress-spinner off
 audit: $(VENV)/dev ## look up the images' packages in the advisories; write an SBOM of each to build/sbom
