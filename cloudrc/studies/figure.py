@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from math import nan
+from math import nan, sqrt
 from statistics import median
 from typing import Any
 
-from cloudrc.metrics.measure import scale
+from cloudrc.metrics.measure import SHIPPED, scale
 from cloudrc.outside.refusal import check_names
 from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.report.figures.style import Look
@@ -18,11 +18,13 @@ from cloudrc.trials.summary import RATIO, count_successes, default_numbers, valu
 
 COLUMN = Look(width=3.5)
 """Look of a figure in one column of a page. Source: IEEE conference template."""
+WIDE = 100.0
+"""Ratio of the largest to the smallest value from which the axis is logarithmic."""
 SHOWN = 3
 """Number of metrics that a figure shows by default."""
 CAPTION = (
     "Median of each point, with its 95 % interval from 6 flights on; success: share and "
-    "Clopper and Pearson's 95 % interval. Open markers: some flights failed."
+    "Clopper and Pearson's 95 % interval. Hollow markers: a flight failed."
 )
 Groups = Mapping[str, Sequence[Sequence[Row]]]
 """Name of a line -> flights of each point."""
@@ -107,16 +109,18 @@ def _metric(name: str, unit: str, groups: Groups, at: Sequence[float]) -> Panel:
     def values(point: Sequence[Row]) -> list[float]:
         return [r["numbers"][name] for r in point if counts(r) and name in r["numbers"]]
 
-    sizes = [
-        abs(value) for points in groups.values() for point in points for value in values(point)
-    ]
-    factor, unit = scale(unit, max(sizes))
+    all_of = [value for points in groups.values() for point in points for value in values(point)]
+    least, most = min(all_of), max(map(abs, all_of))
+    is_log = 0 < least < most / WIDE
+    factor, unit = scale(unit, sqrt(least * most) if is_log else most)
 
     def summarise(point: Sequence[Row]) -> tuple[float, float, float]:
         found = [value * factor for value in values(point)]
         return (median(found), *(median_interval(found) or (nan, nan))) if found else (nan,) * 3
 
-    return Panel(name.replace("_", " "), unit, _lines(groups, at, summarise))
+    metric = SHIPPED.get(name)
+    title = metric.label if metric and metric.label else name.replace("_", " ")
+    return Panel(title, unit, _lines(groups, at, summarise), is_log=is_log)
 
 
 def _rate(point: Sequence[Row]) -> tuple[float, float, float]:

@@ -4,6 +4,8 @@ import json
 
 import pytest
 
+from cloudrc.report.figures.bands import Panel, Point, draw
+from cloudrc.report.figures.style import Look
 from cloudrc.studies.compare import of_sweep
 from cloudrc.studies.figure import draw_sweep
 from cloudrc.studies.sweep import read_flights
@@ -52,6 +54,33 @@ def test_names_along_x_keep_the_order_of_the_grid(tmp_path, drawn):
     draw_sweep(*read_flights(sweep(tmp_path / "s"))[:2], x="predictor", by="gain")
     assert drawn[1:] == ["predictor", ["none", "kalman"], "gain"]
     assert [*drawn[0][0].lines] == ["[1, 2]", "[3, 4]"]
+
+
+def test_values_over_two_decades_have_a_logarithmic_axis_in_a_unit_between_them(drawn):
+    rows = [
+        {"point": {"delay_ms": delay}, "seed": 1} | flown("success", prediction_error_rms=error)
+        for delay, error in ((0, 0.001), (100, 2.0))
+    ]
+    draw_sweep(rows, {"prediction_error_rms": "m"})
+    (panel,) = drawn[0]
+    assert (panel.title, panel.unit, panel.is_log) == ("prediction error, RMS", "mm", True)
+    assert [point.middle for point in panel.lines["delay_ms"]] == [1.0, 2000.0]
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ("link.both.delay_ms", "delay each way (ms)"),
+        ("link.uplink.loss", "loss of the uplink"),
+        ("cloud.predictor.share", "predictor share"),
+        ("robots", "robots"),
+    ],
+)
+def test_a_figure_has_words_in_place_of_keys_and_explains_hollow_markers(key, words):
+    panel = Panel("error", "m", {"a": [Point(1.0, 1.0, 1.0, 1.0, failed=True)]}, is_log=True)
+    svg = draw([panel], key, [], "cloud.predictor", look=Look())["svg"].decode()
+    for text in (words, "error (m)", "predictor", "hollow: a flight failed"):
+        assert f">{text}</text>" in svg
 
 
 def test_a_figure_is_three_files_whose_text_is_text(tmp_path, call):

@@ -20,6 +20,11 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 """Lines take them in turn. The counts of colours and markers have no common factor: only after 56
 lines does a pair of both come again."""
 
+WAYS = {"both": "each way", "uplink": "of the uplink", "downlink": "of the downlink"}
+"""Part of the link in a key -> words."""
+AXIS, PANEL, ALONE, LEGEND_ROW = 0.4, 1.3, 2.1, 0.19
+"""Heights of the x axis, of one of several panels, of a single panel, and of a row of the legend
+[in]."""
 LETTERS_MAX = 100
 """Letters along x that have room in an inch at a size of one point."""
 
@@ -43,33 +48,52 @@ class Panel:
     lines: Mapping[str, Sequence[Point]]
     baseline: float = nan  # value without a network, a dashed line, any unit
     marks: Mapping[str, float] = field(default_factory=dict)  # name -> x of a vertical line
+    is_log: bool = False  # whether its axis is logarithmic
 
 
 def draw(
-    panels: Sequence[Panel], x: str, x_names: Sequence[str], by: str | None, *, look: Look
+    panels: Sequence[Panel],
+    x: str,
+    x_names: Sequence[str],
+    by: str | None,
+    *,
+    look: Look,
+    hollow: str = "hollow: a flight failed",
 ) -> dict[str, bytes]:
     """Draw panels below each other; return the contents of a PDF, a PNG and an SVG file by suffix.
 
     `x` is the key that varies along the x axis, `by` the key that varies between lines (None: one
     line). With `x_names`, the x axis has names instead of numbers, and no line joins the points.
+    `hollow` says what hollow markers mean.
     """
     with own_settings(look):
         crowded = sum(map(len, x_names)) > LETTERS_MAX * look.width / look.font_size
-        figure = new_figure(1.0 + crowded + 1.3 * len(panels), look.width)
+        height = PANEL * len(panels) if len(panels) > 1 else ALONE
+        figure = new_figure(height + crowded, look.width)
         column = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
         for n, (axes, each) in enumerate(zip(column, panels, strict=True)):
             _draw_panel(axes, each, named=bool(x_names))
-            panel(axes, chr(ord("a") + n), each.title + f" ({each.unit})" * bool(each.unit))
+            title = each.title + f" ({each.unit})" * bool(each.unit)
+            if len(panels) > 1:
+                panel(axes, chr(ord("a") + n), title)
+            else:
+                axes.set_title(title, loc="left")
         column[-1].set_xlabel(_label(x))
         if x_names:
             column[-1].set_xticks(range(len(x_names)), x_names)
             column[-1].set_xlim(-0.5, len(x_names) - 0.5)
             if crowded:
                 column[-1].tick_params(axis="x", rotation=90)
+        points = (point for each in panels for line in each.lines.values() for point in line)
+        if any(point.failed for point in points):
+            marker: dict[str, Any] = {"marker": "o", "ms": 4, "mfc": "white", "color": style.GREY}
+            column[0].plot([], [], ls="none", label=hollow, **marker)
+        lines, names = column[0].get_legend_handles_labels()
         if by:
-            lines = column[0].get_legend_handles_labels()
             shape = {"ncols": 2, "alignment": "left", "title_fontsize": look.font_size - 1.0}
-            figure.legend(*lines, loc="outside upper left", title=_label(by), **shape)
+            figure.legend(lines, names, loc="outside upper left", title=_label(by), **shape)
+            height += LEGEND_ROW * (1 + (len(names) + 1) // 2)
+        figure.set_figheight(height + crowded + AXIS)
         return {kind: save(figure, kind) for kind in PRINT_KINDS}
 
 
@@ -92,12 +116,21 @@ def _draw_panel(axes: Axes, content: Panel, *, named: bool) -> None:
         axes.axhline(content.baseline, ls=(0, (5, 3)), label="no network", **look)
     for (name, x), dots in zip(content.marks.items(), cycle(DASHES[3:] + DASHES[2:3])):
         axes.axvline(x, color=style.GREY, lw=0.9, ls=dots, zorder=1, label=name)
-    axes.ticklabel_format(axis="y", useOffset=False)
+    if content.is_log:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.minorticks_off()
+    else:
+        axes.ticklabel_format(axis="y", useOffset=False)
     if content.unit == "%":
         axes.set_ylim(-5.0, 105.0)
 
 
 def _label(key: str) -> str:
-    """Write the unit of a key in parentheses: "link.both.delay (ms)"."""
+    """Write a key in words, its unit in parentheses: "delay each way (ms)"."""
     name, _, end = key.rpartition("_")
-    return f"{name} ({UNITS[end]})" if end in UNITS else key
+    name, unit = (name, f" ({UNITS[end]})") if end in UNITS else (key, "")
+    section, _, rest = name.partition(".")
+    way, _, what = rest.partition(".")
+    words = f"{what} {WAYS[way]}" if section == "link" and way in WAYS else rest or name
+    return words.replace(".", " ").replace("_", " ") + unit
