@@ -366,3 +366,9 @@ $(VENV)/deep: pyproject.toml | $(VENV)/dev
 $(VENV)/site: tools/site-requirements.txt | $(VENV)/dev
 	$(bin)/python -m pip install --disable-pip-version-check --quiet --requirement $<
 	@touch $@
+
+.PHONY: pictures
+pictures: $(VENV)/dev ## draw the README's film and the pictures of robots and missions; needs EGL (libegl1): minutes
+	@$(bin)/python -c "import tools.pictures.stage" || { \
+		echo "make pictures needs EGL: apt-get install libegl1 libgl1-mesa-dri" >&2; exit 3; }
+	$(bin)/python -m tools.pictures

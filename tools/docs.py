@@ -6,6 +6,8 @@ signatures of the shipped plug-ins. The tables of docs/topics.md come from
 around the tables is written by hand. `QUANTITIES` gives panels to the dashboard of missions. The
 table of docs/on-call.md comes from the chart's `files/rules.yaml`.
 
+Each shipped robot and mission has a page of its own (`tools/guests.py`).
+
 The chart's schema and table come from its `values.yaml`. Shipped profiles and missions are copied,
 because a chart can read only its own files.
 """
@@ -36,6 +38,8 @@ from cloudrc.record.topics import TOPICS
 from tools import metadata
 from tools.chart_values import added, earliest, make_schema, table_rows
 from tools.dashboards import UNITS
+from tools.guests import FLIGHTS, link, pages
+from tools.markdown import table
 
 ROOT = Path(__file__).resolve().parents[1]
 CHART = ROOT / "charts" / "cloudrc"
@@ -127,6 +131,7 @@ def outputs() -> dict[Path, str]:
         **insert(ROOT / "docs" / "topics.md", _topics()),
         **insert(ROOT / "docs" / "metrics.md", _metrics()),
         **insert(ROOT / "docs" / "on-call.md", f"\n{_alerts()}"),
+        **pages(),
         **insert(CHART / "README.md", f"\n{rows}"),
         **insert(CHART / "files" / "dashboards" / "missions.yaml", f"{panels(QUANTITIES)}# "),
         CHART / "values.schema.json": json.dumps(make_schema(values), indent=2) + "\n",
@@ -152,14 +157,6 @@ def insert(page: Path, text: str) -> dict[Path, str]:
         raise ValueError(f"{page.name}: needs one pair of marks around the generated text")
     parts[2] = text
     return {page: "".join(parts)}
-
-
-def table(columns: str, rows: Iterable[Iterable[object]]) -> str:
-    """Format a table in Markdown; `columns` contains the column titles, separated by bars."""
-    lines = [f"| {columns} |", f"|{'---|' * len(columns.split('|'))}"]
-    for row in rows:
-        lines.append(f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in row)} |")
-    return "\n".join(lines) + "\n"
 
 
 def flow(value: Any) -> str:
@@ -307,14 +304,16 @@ def _arguments(function: Any) -> dict[str, str]:
 
 def _shipped() -> str:
     blocks = []
-    for kind in ("experiment", "mission", "profile"):
-        rows = ((f"`{name}`", shipped.describe(kind, name)) for name in shipped.names(kind))
+    for kind in ("experiment", "mission", "robot", "profile"):
+        rows = ((_name(kind, name), shipped.describe(kind, name)) for name in shipped.names(kind))
         blocks.append(table(f"{kind} | description", rows))
-    for kind in ("robot", "scene"):
-        blocks.append(
-            f"{kind.capitalize()}s: {', '.join(f'`{n}`' for n in shipped.names(kind))}.\n"
-        )
+    blocks.append(f"Scenes: {', '.join(f'`{each}`' for each in shipped.names('scene'))}.\n")
     return "\n".join(blocks)
+
+
+def _name(kind: str, name: str) -> str:
+    """Return a shipped file's name, with a link if it has a page."""
+    return link(kind, name) if kind in FLIGHTS else f"`{name}`"
 
 
 def _topics() -> str:

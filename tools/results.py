@@ -16,7 +16,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from cloudrc.statistics import median_interval
-from tools.docs import insert, table
+from tools.docs import insert
+from tools.markdown import table
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, SWEEPS = ROOT / "docs" / "results.md", ROOT / "docs" / "sweeps"

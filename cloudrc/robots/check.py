@@ -63,7 +63,7 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
     hull_of(name)
     advise(world, ZERO)
     body = build_robot(world, ResolvedGuard.model_validate({}))
-    facts = _read_facts(world, robot, body.simulator.model)
+    facts = read_facts(world, robot, body.simulator.model)
     changes, failures = [*doubts(name)], list[ConfigProblem]()
     for tuning in robot.tunings:  # an experiment may choose it
         with collect(failures, ()):
@@ -80,7 +80,7 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
     return facts, [*changes, *_judge(robot, facts, rest)]
 
 
-def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
+def read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
     """Return the facts that need no motion."""
     base = model.jnt_bodyid[0]
     ratio = thrust_to_weight(model) if not robot.planar else None
