@@ -2,6 +2,7 @@
 
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -80,6 +81,14 @@ def folder(tmp_path_factory):
     for name, body in FILES.items():
         (path / name).write_text(body)
     return path
+
+
+def test_the_python_of_the_readme_prints_what_it_shows(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shown = {language: body for _, language, body in BLOCK.findall((ROOT / PAGES[0]).read_text())}
+    (tmp_path / "ten_lines.py").write_text(shown["python"])
+    runpy.run_path("ten_lines.py")
+    assert capsys.readouterr().out == shown["text"]
 
 
 PROGRESS = re.compile(r"(([a-z]+s| +[\d.]+ s) .*\n)*")
