@@ -140,8 +140,14 @@ def draw_outcomes(outcomes: Sequence[Mapping[str, Any]], compute: float) -> dict
     """
     left_out = "return" if "success" in outcomes[0] else "success"
     panels = [panel_of(outcomes, compute, *each) for each in PANELS if left_out not in each]
-    axes = "age of the loop_ms", [], "executor"
-    return draw(panels, *axes, look=Look(width=WIDTH), hollow="hollow: no answer in time")
+    return draw(
+        panels,
+        "age of the loop_ms",
+        [],
+        "executor",
+        look=Look(width=WIDTH),
+        hollow="hollow: no answer in time",
+    )
 
 
 def panel_of(

@@ -144,8 +144,9 @@ def draw_capacity(document: Mapping[str, Any], look: Look) -> dict[str, bytes]:
         Panel(age, "ms", lines(partial(_worst, "age_p99_ms")), limit),
         Panel("commands", "Hz", lines(partial(_worst, "rate_hz"))),
     ]
-    axes = "robots", [], "queue, controller"
-    return draw(panels, *axes, look=look, hollow="hollow: a fleet failed")
+    return draw(
+        panels, "robots", [], "queue, controller", look=look, hollow="hollow: a fleet failed"
+    )
 
 
 def _share(fleet: Row) -> Values:
