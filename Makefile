@@ -277,6 +277,7 @@ docs: $(VENV)/dev ## write the generated tables of docs/, and the chart's schema
 site: $(VENV)/site ## build all pages into build/site; a link that leads nowhere is an error
 	$(bin)/python -m tools.site pages build/pages
 	$(bin)/zensical build --strict --clean
+	$(bin)/python -m tools.site plain build/pages build/site
 	$(bin)/python -m tools.site check build/site
 
 # The time of all files in them: two builds of one commit are byte-equal.

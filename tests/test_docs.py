@@ -8,10 +8,10 @@ import pytest
 from cloudrc.record.topics import TOPICS
 from tests.support.commands import python
 from tools import docs
-from tools.site import dead_links, relinked, site_name
+from tools.site import contents, dead_links, prepare, relinked, write_plain
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), ROOT / "charts" / "cloudrc" / "README.md"]
+PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("charts/**/*.md")]
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]+))?\)")
 OUTPUTS = docs.outputs()
 FILE = re.compile(r"`([\w./*-]+(?:\.(?:py|yaml|md|svg)|/))`")
@@ -62,18 +62,18 @@ def test_the_tour_names_what_exists_and_follows_a_packet():
     assert 0.0 < float(said[0]) < float(said[1]) < float(said[2])
 
 
-def test_the_list_of_pages_names_every_page():
-    listed = {path for path, _ in LINK.findall((ROOT / "docs" / "README.md").read_text())}
-    pages = {path.relative_to(ROOT / "docs").as_posix() for path in ROOT.glob("docs/**/*.md")}
-    assert pages - {"README.md"} <= listed
-
-
-def test_the_navigation_of_the_site_names_every_page():
-    nav = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
+def test_the_list_of_pages_names_every_page_once():
+    listed = [source for pages in contents().values() for source, _ in pages]
     pages = {path.relative_to(ROOT).as_posix() for path in PAGES}
-    assert set(re.findall(r"[\w/-]+\.md$", nav, re.MULTILINE)) == {
-        site_name(each) for each in pages
-    }
+    assert sorted(listed) == sorted(pages - {"README.md", "docs/README.md"})
+
+
+def test_an_assistant_gets_a_list_of_all_pages_and_each_as_markdown(tmp_path):
+    prepare(tmp_path / "pages")
+    write_plain(tmp_path / "pages", tmp_path / "site")
+    listed = LINK.findall((tmp_path / "site" / "llms.txt").read_text())
+    assert len(listed) == len(PAGES) - 1  # not the list itself
+    assert all((tmp_path / "site" / name).is_file() for name, _ in listed)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,8 @@ The tables of docs/experiment.md come from the models in `cloudrc/config/schema.
 signatures of the shipped plug-ins. The tables of docs/topics.md come from
 `cloudrc/record/topics.py`, those of docs/metrics.md from `cloudrc/exposition/table.py`. The text
 around the tables is written by hand. `QUANTITIES` gives panels to the dashboard of missions. The
-table of docs/on-call.md comes from the chart's `files/rules.yaml`.
+table of docs/on-call.md comes from the chart's `files/rules.yaml`. The menu of the site is the list
+of pages in docs/README.md.
 
 Each shipped robot and mission has a page of its own (`tools/guests.py`).
 
@@ -40,6 +41,7 @@ from tools.chart_values import added, earliest, make_schema, table_rows
 from tools.dashboards import UNITS
 from tools.guests import FLIGHTS, link, pages
 from tools.markdown import table
+from tools.site import contents, site_name
 
 ROOT = Path(__file__).resolve().parents[1]
 CHART = ROOT / "charts" / "cloudrc"
@@ -133,6 +135,7 @@ def outputs() -> dict[Path, str]:
         **insert(ROOT / "docs" / "on-call.md", f"\n{_alerts()}"),
         **pages(),
         **insert(CHART / "README.md", f"\n{rows}"),
+        **insert(ROOT / "mkdocs.yml", f"{_navigation()}# "),
         **insert(CHART / "files" / "dashboards" / "missions.yaml", f"{panels(QUANTITIES)}# "),
         CHART / "values.schema.json": json.dumps(make_schema(values), indent=2) + "\n",
         CHART / "files" / "added.yaml": ADDED + yaml.safe_dump(new, sort_keys=False),
@@ -311,9 +314,10 @@ def _shipped() -> str:
     return "\n".join(blocks)
 
 
-def _name(kind: str, name: str) -> str:
-    """Return a shipped file's name, with a link if it has a page."""
-    return link(kind, name) if kind in FLIGHTS else f"`{name}`"
+table of docs/on-call.md comes from the chart's `files/rules.yaml`. The menu of the site is the list
+of pages in docs/README.md.
+
+Each shipped robot and mission has a page of its own (`tools/guests.py`).
 
 
 def _topics() -> str:

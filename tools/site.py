@@ -5,6 +5,9 @@ they link to each other as GitHub shows them; the copies link to pages of the si
 docs/ to which a page links become pages, too. The pages of commands and of Python get what argparse
 and docstrings say.
 
+`python -m tools.site plain PAGES SITE` puts the pages as Markdown into the finished site, and their
+list for assistants, llms.txt (https://llmstxt.org).
+
 `python -m tools.site check FOLDER` ends with 1 if a link in a finished site leads nowhere.
 """
 
@@ -28,10 +31,13 @@ NAMES = {
     "README.md": "index.md",
     "docs/README.md": "pages.md",
     "charts/cloudrc/README.md": "chart.md",
+    "charts/cloudrc/UPGRADING.md": "upgrading.md",
 }
 """Page of the repository -> page of the site, where it is not that below docs/."""
 FENCE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(\]\()(?!https?:|#)([^)#\s]+)")
+LISTED = re.compile(r"^\| (.*?\]\(.*?) \| (.*) \|$", re.MULTILINE)
+"""A row of docs/README.md: one or more pages, and what they answer."""
 
 
 def prepare(folder: Path) -> None:
@@ -88,6 +94,46 @@ def relinked(source: str, text: str) -> str:
     parts = FENCE.split(text)
     parts[::2] = [LINK.sub(replace, part) for part in parts[::2]]
     return "".join(parts)
+
+
+def contents() -> dict[str, list[tuple[str, str]]]:
+    """Read docs/README.md: heading -> its pages, each a file and what it answers."""
+    parts = re.split("^## (.*)\n", (ROOT / "docs" / "README.md").read_text("utf-8"), flags=re.M)
+    return {
+        head: [
+            (path, about)
+            for cell, about in LISTED.findall(text)
+            for path in links("docs/README.md", cell)
+        ]
+        for head, text in zip(parts[1::2], parts[2::2], strict=True)
+    }
+
+
+def write_plain(pages: Path, site: Path) -> None:
+    """Copy the prepared pages into the finished site, and write their list for assistants."""
+    for page in pages.rglob("*.md"):
+        copy = site / page.relative_to(pages)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(page, copy)
+    blocks = ["# cloudrc\n", f"> {described()}\n"]
+    for head, listed in {
+        "First": [("README.md", "what cloudrc is, and the first minute")],
+        **contents(),
+    }.items():
+        rows = (f"- [{title(source)}]({site_name(source)}): {about}\n" for source, about in listed)
+        blocks.append(f"## {head}\n\n{''.join(rows)}")
+    (site / "llms.txt").write_text("\n".join(blocks), encoding="utf-8")
+
+
+def described() -> str:
+    """Return the sentence that describes the site."""
+    settings = (ROOT / "mkdocs.yml").read_text("utf-8")
+    return re.findall("^site_description: (.*)$", settings, re.MULTILINE)[0]
+
+
+def title(source: str) -> str:
+    """Return the first heading of a page."""
+    return (ROOT / source).read_text("utf-8").partition("# ")[2].partition("\n")[0]
 
 
 def commands() -> str:
@@ -147,10 +193,13 @@ def is_dead(path: Path, link: SplitResult, pages: Mapping[Path, Page]) -> bool:
     return not target.is_file()
 
 
-def main(what: str, folder: str) -> int:
+def main(what: str, folder: str, site: str = "") -> int:
     """Do what the command line asks for."""
     if what == "pages":
         prepare(Path(folder))
+        return 0
+    if what == "plain":
+        write_plain(Path(folder), Path(site))
         return 0
     dead = sorted(dead_links(Path(folder)))
     print("\n".join(dead) or f"{folder}: no dead link")
