@@ -1,7 +1,7 @@
-"""Play a tutorial as its reader does: save its files, type its commands, compare what they print.
+"""Play a page as its reader does: save its files, type its commands, compare what they print.
 
-A block of `bash` is typed line by line; one of `sh` is not. A block of `text` has lines that its
-commands have printed, in this order; `...` stands for any lines. A mark before a block says more.
+Of a tutorial, a block of `text` has lines that its commands have printed, in this order; `...`
+stands for any lines. tests/support/pages.py tells the marks of blocks.
 """
 
 import os
@@ -12,9 +12,8 @@ import sys
 from pathlib import Path
 
 from tests.conftest import wait_until
+from tests.support.pages import SHELL, blocks_of, files_of
 
-FOLDER = Path(__file__).resolve().parents[1] / "docs" / "tutorials"
-BLOCK = re.compile(r"(?:<!-- test: ([^\n]+) -->\n)?```(\w+)\n(.*?)```", re.DOTALL)
 OTHER_NUMBERS = "other numbers"
 """Mark of a block of `text` whose numbers differ each time, because the commands took real time."""
 READY = "to end: "
@@ -22,33 +21,39 @@ READY = "to end: "
 
 
 class Reader:
-    """A person with two terminals in one folder."""
+    """A person with two terminals in one folder, who `has` some of what `NEEDS` lists."""
 
-    def __init__(self, folder, **environment):
+    def __init__(self, folder, *has, **environment):
         path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
         # PYTHONPATH is that of the tests; no page may open.
         self.environment = {**os.environ, "PATH": path, "BROWSER": "true", **environment}
         self.folder, self.said = folder, ""
         self.first = None
+        self.has = {*has}
 
-    def play(self, name, left_out=""):
-        """Play a tutorial; blocks with the mark `left_out` are not typed."""
-        for mark, language, body in BLOCK.findall((FOLDER / f"{name}.md").read_text("utf-8")):
-            if mark and mark == left_out:
-                continue
-            if language == "text":
-                self.compare(body, mark == OTHER_NUMBERS)
-            elif language == "bash":
+    def play(self, page, left_out=None, compares=True):
+        """Play a page of the repository; blocks with the mark `left_out` are not typed.
+
+        Neither are blocks that need what this reader does not have. With `compares`, look whether
+        its blocks of text were printed.
+        """
+        for name, text in files_of(page).items():
+            (self.folder / name).write_text(text, encoding="utf-8")
+        for block in blocks_of(page):
+            if block.language == "text" and compares:
+                self.compare(block.body, block.mark == OTHER_NUMBERS)
+            elif block.language in SHELL and block.mark != left_out and block.needs <= self.has:
                 self.said = ""
-                for line in body.replace("\\\n", "").splitlines():
-                    self.start(line) if mark == "first terminal" else self.type(line)
-            elif mark:
-                (self.folder / mark).write_text(body, encoding="utf-8")
+                for line in block.lines:
+                    self.start(line) if block.mark == "first terminal" else self.type(line)
 
     def type(self, line):
         """Type a line; its command may only fail if a mission fails."""
-        if line.startswith("mkdir "):
-            return  # the test has a folder of its own
+        if line.startswith(("mkdir ", "pip install ")):
+            return  # the test has a folder of its own, and all packages
+        if line.startswith("cd "):
+            self.folder /= line.removeprefix("cd ")
+            return
         done = subprocess.run(
             ["bash", "-c", line],
             cwd=self.folder,

@@ -314,10 +314,19 @@ def _shipped() -> str:
     return "\n".join(blocks)
 
 
-table of docs/on-call.md comes from the chart's `files/rules.yaml`. The menu of the site is the list
-of pages in docs/README.md.
+def _name(kind: str, name: str) -> str:
+    """Return a shipped file's name, with a link if it has a page."""
+    return link(kind, name) if kind in FLIGHTS else f"`{name}`"
 
-Each shipped robot and mission has a page of its own (`tools/guests.py`).
+
+def _navigation() -> str:
+    """Format the menu of the site: the headings of docs/README.md, with their pages."""
+    lines = ["nav:"]
+    for number, (head, rows) in enumerate(contents().items()):
+        first = [] if number else ["index.md", "All pages: pages.md"]
+        names = [*first, *(site_name(source) for source, _ in rows)]
+        lines += [f"  - {head}:", *(f"      - {name}" for name in names)]
+    return "\n".join(lines) + "\n"
 
 
 def _topics() -> str:

@@ -22,6 +22,7 @@ def test_the_tutorial_on_a_cluster_works(tmp_path):
     command("kubectl", f"--kubeconfig={own}", *set_namespace)
     command("kubectl", "create", "namespace", OWN)
     try:
-        Reader(ROOT, KUBECONFIG=str(own)).play("cluster", left_out="only without a cluster")
+        reader = Reader(ROOT, "a cluster", "a session", KUBECONFIG=str(own))
+        reader.play("docs/tutorials/cluster.md", left_out="only without a cluster")
     finally:
         command("kubectl", "delete", "namespace", OWN, "--wait=false")

@@ -8,4 +8,4 @@ from tests.tutorials import Reader
 @pytest.mark.tun
 @pytest.mark.full
 def test_the_tutorial_of_two_programs_works(tmp_path):
-    Reader(tmp_path).play("two-programs")
+    Reader(tmp_path, "namespaces").play("docs/tutorials/two-programs.md")
