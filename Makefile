@@ -53,7 +53,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo live live-flight test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly viser lint spdx types api audit bench bench-cell results docs site dist owner images kind-load lock clean
+.PHONY: help demo live live-flight test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly viser lint spdx types api audit bench bench-cell results shown docs site dist owner images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -270,6 +270,9 @@ bench-cell: $(VENV)/all ## measure how punctual the cell of 50 robots is
 
 results: $(VENV)/dev ## fly the results of docs/results.md and write them into it: two minutes
 	$(bin)/python -m tools.results
+
+shown: $(VENV)/dev ## compare the numbers on pages with what their commands give: 15 minutes
+	$(bin)/python -m tools.shown
 
 docs: $(VENV)/dev ## write the generated tables of docs/, and the chart's schema, table and copied files
 	$(bin)/python -m tools.docs
