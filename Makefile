@@ -282,6 +282,7 @@ site: $(VENV)/site ## build all pages into build/site; a link that leads nowhere
 	$(bin)/zensical build --strict --clean
 	$(bin)/python -m tools.site plain build/pages build/site
 	$(bin)/python -m tools.site check build/site
+	$(bin)/python -m tools.words
 
 # The time of all files in them: two builds of one commit are byte-equal.
 EPOCH = $(shell git log -1 --format=%ct)

@@ -9,6 +9,7 @@ from cloudrc.record.topics import TOPICS
 from tests.support.commands import python
 from tools import docs
 from tools.site import contents, dead_links, prepare, relinked, write_plain
+from tools.words import lines
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("charts/**/*.md")]
@@ -40,6 +41,12 @@ def test_every_link_leads_somewhere(page):
         target = page.parent / path if path else page
         assert target.exists(), path
         assert not anchor or anchor in anchors(target), f"{path}#{anchor}"
+
+
+def test_the_words_of_each_door_can_be_counted():
+    """Each page that its reader reads is there, up to a heading that exists."""
+    counted = [line for line in lines() if "first own result" in line]
+    assert [line.partition(":")[0] for line in counted] == [*contents()][1:6]
 
 
 def test_every_file_in_the_architecture_exists():
