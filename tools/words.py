@@ -25,7 +25,11 @@ DOORS: dict[str, tuple[tuple[str, str], ...]] = {
     "A policy over a network": (FIRST, ("docs/tutorials/policy.md", "")),
     "Two programs or ROS nodes": (FIRST, ("docs/tutorials/two-programs.md", "")),
     "A lab on a cluster": (FIRST, ("docs/tutorials/cluster.md", "")),
-    "A class": (FIRST, ("docs/exercise.md", "")),
+    "A class": (
+        FIRST,
+        ("docs/exercise.md", "## Part 2"),
+        ("docs/class.md", "## How it scores"),
+    ),
 }
 """Door -> what its reader reads until a first result of his own: a page, and the beginning of the
 line before which he stops (nothing: he reads it to its end)."""
