@@ -92,7 +92,7 @@ SHOWN = (
         ),
     ),
     Shown(
-        "docs/compare.md",
+        "docs/margin.md",
         "cloudrc margin link.both.delay_ms --of steps",
         60.0,
         (
@@ -118,7 +118,7 @@ SHOWN = (
         },
     ),
     Shown(
-        "docs/method.md",
+        "docs/definitions.md",
         "cloudrc run paper-verbatim --mode virtual --report none --set link.profile=paper-p3",
         5.0,
         numbers={"delay_sample_mean": ".150 s", "loop_delay_mean": ".142 s"},
@@ -137,7 +137,7 @@ SHOWN = (
         ),
     ),
     Shown(
-        "docs/fleet.md",
+        "docs/capacity.md",
         "cloudrc capacity steps --cell 1000 --queue fifo,newest --seeds 10",
         300.0,
         (
@@ -146,7 +146,7 @@ SHOWN = (
         ),
     ),
     Shown(
-        "docs/fleet.md",
+        "docs/place.md",
         "cloudrc place fast --set cloud.controller=mpc --compute 0,20,60",
         120.0,
         (
@@ -156,7 +156,7 @@ SHOWN = (
         ),
     ),
     Shown(
-        "docs/fleet.md",
+        "docs/place.md",
         "cloudrc place steps --calm --compute 60 --robots 1,4",
         60.0,
         (
