@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 # Targets for developers; `make` alone lists them. Needs Python 3.11 or newer, make and git.
 PYTHON ?= python3
 VENV ?= .venv
@@ -236,6 +238,8 @@ lint: $(VENV)/dev ## check format and rules
 		else echo "no actionlint here: the workflows are not checked"; fi
 	@if command -v helm >/dev/null; then helm lint --quiet --strict --kube-version 1.29.0 charts/cloudrc; \
 		else echo "no helm here: the chart is checked by 'make test' alone"; fi
+	@! { $(LICENSED) | xargs -0 grep -L SPDX-License-Identifier $(SCRIPTS) | grep .; } || { \
+		echo "these files lack the line of the licence; run: make spdx" >&2; exit 1; }
 
 # Sources that name their licence, beside SCRIPTS. REUSE.toml speaks for all other files, and for those of one byte.
 LICENSED = git ls-files -z -- '*.py' '*.c' '*.js' '*.css' Makefile 'images/*/Dockerfile' '.github/**.y*ml' \

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """cloudrc: a testbed for robots that are controlled from the cloud."""
 
 from typing import TYPE_CHECKING, Any

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run the command `cloudrc` as `python -m cloudrc`."""
 
 from cloudrc.cli.main import main

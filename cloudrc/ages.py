@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compute how old commands and their confirmations become, before a flight.
 
 The delays are those of the flight, because link and cloud draw the same random numbers.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The Python API: fly, sweep, compare, identify and verify from a program or a notebook.
 
     import cloudrc

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Build world, cloud and link from an experiment, and convert its values to SI units.
 
 World and cloud do not import each other. Drivers use them only through `cloudrc.endpoint.Endpoint`.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define the interface of world and cloud to their driver: state machines without I/O.
 
 World and cloud are endpoints, the two ends of the tunnel. An endpoint has no socket, no clock and

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Errors that a user can fix: one line that says what is wrong, where, and what to do."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read and write files that other processes write or read at the same time.
 
 Reading never blocks. Writing replaces the file in one step.

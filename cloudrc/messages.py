@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The messages between world, cloud and teleoperation.
 
 Messages are named tuples in SI units; creating a frozen dataclass would take four times as long.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find plug-ins by kind and name, and build them.
 
 A plug-in is one file with a function `build(**parameters)`. Its name in a configuration is the file

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The records of a run, which world, cloud and the drivers make during a flight.
 
 A record is a named tuple. `stamp_ns` is the time at which the record was made [ns], on the clock of

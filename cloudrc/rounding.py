@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What is equal up to rounding is equal: one rule for every comparison of computed numbers.
 
 The rule holds wherever a number of a flight is compared with a limit of a user or of the verdict,

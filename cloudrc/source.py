@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Name the code that a flight runs: one hash of all source files that can change its numbers.
 
 Flights of different code must not be mixed in one table, and `__version__` is equal for all commits

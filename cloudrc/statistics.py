@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compute medians, paired differences and success rates, with exact intervals and tests.
 
 No function uses random numbers. docs/method.md explains the choice of the methods.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Texts: tables for people, programs and papers; numbers, positions; text from files."""
 
 from __future__ import annotations

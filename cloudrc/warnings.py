@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Warn about settings with which a flight is pointless: no packet arrives, or no mission succeeds.
 
 The delays come from a simulation of link and computing time alone: `ages.py`. A warning never

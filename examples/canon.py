@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Results of networked control that are known exactly, beside what cloudrc measures.
 
     python examples/canon.py            # the table of docs/closed-forms.md: minutes

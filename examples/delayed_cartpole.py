@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Train PPO on CartPole behind a delay, with and without memory of its own actions.
 
     pip install 'cloudrc[gym]' stable-baselines3

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A task without weights on which a policy's answers disagree: pass poles on the left or right.
 
     python examples/fork.py [EPISODES]     # the table of docs/executors.md

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Executor: send the observation only if it is at least `delta` away from 0; act on each answer.
 
 `asks` sees the observation of each step on board; the policy has what is sent:

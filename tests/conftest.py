@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fixtures of all tests: commands, a browser, scenes, sweeps, signals as in a new process."""
 
 import gc

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The fence of the shipped scenes."""
 
 from cloudrc.geometry.obstacles import fence_of

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A stand-in for a tensor of PyTorch, which refuses numpy what PyTorch refuses."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How old commands become, by a simulation without a flight."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The Python API: one call flies and returns verdict, numbers and columns."""
 
 import importlib

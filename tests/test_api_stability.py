@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`make api` sees what breaks a caller of a public name, and nothing else."""
 
 import re

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The import rules of the package and the sizes of its files and functions."""
 
 import ast

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A change of the chart needs a version of its own."""
 
 import subprocess

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Every command that a page prints is one that cloudrc takes, and those that can be typed work."""
 
 import re

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Every float, vector and array in a public docstring has its unit.
 
 A unit is in brackets: [s], [m/s]; [1] means no unit. "Likewise" means the unit of the line above.

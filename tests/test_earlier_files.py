@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Files that cloudrc 0.1.0 has written are read."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Whose a file is: nobody else may own or write it, its folder, or a folder above."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What a newcomer sees of `make demo` and `make live`; their programs only say their words."""
 
 import os

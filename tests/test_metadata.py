@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What others read about cloudrc has the form that they ask for, and one source of authors."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The package: dependencies, version, licence and the files of the wheel."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The commands and the files in README.md and in some pages of docs/ work."""
 
 import os

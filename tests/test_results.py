@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The numbers in docs/results.md are those of this version: within the intervals of a new sweep."""
 
 import re

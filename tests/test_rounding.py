@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Numbers that are equal up to rounding are equal."""
 
 from math import inf, nan

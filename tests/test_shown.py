@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The numbers that pages show are those that their commands give."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The hash of the code depends on all sources that a flight can run, and on nothing else."""
 
 import shutil

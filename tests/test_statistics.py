@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Intervals and tests have the values of published tables."""
 
 from itertools import compress, product

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """cloudrc on macOS and Windows, as far as a Linux can show it."""
 
 import os

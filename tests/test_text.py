@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Tables for papers and programs keep each value."""
 
 import csv

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The commands of the tutorials work, and print what the pages show."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Warnings before a flight: settings that do not fit together, with a key and value that would."""
 
 import re

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Play a page as its reader does: save its files, type its commands, compare what they print.
 
 Of a tutorial, a block of `text` has lines that its commands have printed, in this order; `...`

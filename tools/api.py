@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compare the public Python API with an earlier commit: `make api`.
 
 docs/api.md lists the public names. After the first release, a change that breaks a caller ends with

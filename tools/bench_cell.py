@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`make bench-cell`: how punctual is the process `cloudrc cell` with many robots?
 
 Each robot's world and cloud send 100 datagrams a second through one process. Beside it,

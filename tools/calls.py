@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Print how many calls it takes to load, advise on, assemble and fly an experiment, warm.
 
     python -m tools.calls [EXPERIMENT]

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Make the chart's schema and its table of values from the file `values.yaml`.
 
 A key with a comment above it is a value or a section; the comment is its description. The type of a

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Refuse a change of the chart without a higher version of it; CI runs this.
 
 python -m tools.chart_version [SINCE]    the commit to compare with (default: HEAD^)

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run the queries of the chart's dashboards in Prometheus, as Grafana would.
 
 The end-to-end tests use this module: they need no Grafana.

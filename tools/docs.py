@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Write all generated files. `make docs` runs this module; a test compares the files.
 
 The tables of docs/experiment.md come from the models in `cloudrc/config/schema.py` and from the

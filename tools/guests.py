@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Write a page for each shipped robot and mission: picture, command, facts and limits.
 
 The facts come from the files of the package and from the compiled models. `make docs` writes the

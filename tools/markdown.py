@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Write parts of pages in Markdown."""
 
 from __future__ import annotations

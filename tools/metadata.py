@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Write authors, version and requirements for those who archive, cite or package cloudrc.
 
 `make docs` runs this with `tools.docs`. The authors come from CITATION.cff, the requirements from

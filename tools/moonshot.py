@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Judge the flights of `make moonshot`: does a second of round trip matter?
 
     python -m tools.moonshot build/moonshot     # exit code 1: it does

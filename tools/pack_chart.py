@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Pack the Helm chart with the same bytes for the same files: used by `make dist`.
 
 `helm package` stamps each file with the present time, before Helm 4 always. This tool takes its

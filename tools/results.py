@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Write the table and the picture of results in docs/results.md: `make results` takes two minutes.
 
 A nightly test flies again: each number in the table must lie within the interval of its sweep.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Write the registry of a release's images into the chart, before wheel and chart are built.
 
     python tools/set_registry.py REGISTRY                         before wheels are built

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The numbers that pages show, with the commands that give them.
 
 `python -m tools.shown` types every command, says how long it took, and names what differs from the

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Prepare the pages of the site, and look for dead links in the finished site: `make site`.
 
 `python -m tools.site pages FOLDER` copies the repository's pages into a folder. In the repository

@@ -1,3 +1,7 @@
+/*
+ * SPDX-License-Identifier: Apache-2.0
+ */
+
 /* Print how late this machine wakes a process that sleeps until a given time: p50 and p99 [us].
  *
  * cc -O2 -o wake_lateness tools/wake_lateness.c && ./wake_lateness [SECONDS]

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Count the words of the pages, and the minutes of reading of each door: `make site` prints them.
 
 A word is what stands between blanks, also in tables and in code. The tables that `make docs` writes

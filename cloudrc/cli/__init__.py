@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The command line: one module per command.
 
 Each module has `arguments(parser)` and `execute(options) -> exit code`. Modules import numpy,

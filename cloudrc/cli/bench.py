@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc bench`: measure how much processor time the closed loop needs on this machine.
 
 The command flies the experiment `paper`. For comparison, it also measures two other workloads: one

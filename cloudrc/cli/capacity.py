@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc capacity EXPERIMENT`: how many robots do one cell and one cloud carry?"""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run `cloudrc cell`: the process through which the packets of a fleet pass."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc compare A B`: compare flights with the settings A and B; print p values."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc completion SHELL`: print a script that completes command lines on the Tab key.
 
 Package shtab writes the script. It contains all commands, options and shipped names, so completion

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run `cloudrc console`: serve a page in the browser that shows a flight and steers it."""
 
 from __future__ import annotations

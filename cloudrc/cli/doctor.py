@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc doctor`: check whether this machine can fly; print how to fix each problem.
 
 With `--release` it looks at a release in a cluster instead.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc eval`: measure whether a policy survives a network."""
 
 from __future__ import annotations

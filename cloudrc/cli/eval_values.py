@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read what the flags of `cloudrc eval` give."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc class`: hand out and score a task, by default the exercise of docs/exercise.md.
 
 The students' functions run in a process of their own for each part of the task, so that a crash

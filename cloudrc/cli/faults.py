@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run `cloudrc faults`: inject faults and check how the system reacts."""
 
 from __future__ import annotations

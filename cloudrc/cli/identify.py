@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc identify RUN`: fit a model of the velocity loop for the predictor `command_history`."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc key`: make or rotate the tunnel's pre-shared key."""
 
 from __future__ import annotations

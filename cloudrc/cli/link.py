@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run `cloudrc link VERB`. The modules `cli/link_<verb>.py` contain the verbs."""
 
 from __future__ import annotations

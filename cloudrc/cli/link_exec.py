@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run `cloudrc link exec`: two programs with the emulated link between them."""
 
 from __future__ import annotations

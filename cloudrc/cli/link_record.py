@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run `cloudrc link record SOURCE`: turn measured delays into a trace for a profile.
 
 The source is a run, an MCAP file, a log of ping or irtt, or a CSV file. The command detects the

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run `cloudrc link run`: the process that shapes one direction of a link."""
 
 from __future__ import annotations

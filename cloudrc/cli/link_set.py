@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run `cloudrc link set`: change the link during a flight, on this machine or in a cluster."""
 
 from __future__ import annotations

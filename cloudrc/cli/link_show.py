@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run `cloudrc link show`: draw a profile and print its statistics."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run `cloudrc link verify`: compare a link with its profile, by probes or in flight."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc list`: list the names that an experiment may use, or the releases of a cluster."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run the given command of `cloudrc`; print an error in one line."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc margin KEY`: up to which value of KEY is the loop stable, and do flights succeed?"""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc measure compute`: how long does a controller compute a command?"""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run `cloudrc mission`: fly and steer missions by requests to the API of teleop.
 
 In a cluster, `run` creates a Kubernetes Job, whose pod posts the mission to the API.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc new`: write the files of a robot of one's own."""
 
 from __future__ import annotations

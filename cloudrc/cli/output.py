@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Output of commands: tables and colour for people, JSON and YAML for programs."""
 
 from __future__ import annotations

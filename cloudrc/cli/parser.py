@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Build the parser of the command line from a table of commands and their help lines."""
 
 from __future__ import annotations

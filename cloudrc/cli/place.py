@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc place EXPERIMENT`: where should the controller run?"""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc policy`: serve a policy for robots and evaluations."""
 
 from __future__ import annotations

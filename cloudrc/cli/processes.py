@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run the processes `cloudrc world` and `cloudrc cloud` of a local run or a pod."""
 
 from __future__ import annotations

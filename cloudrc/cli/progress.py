@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Show on stderr what a long command does: a moving line on a terminal, else a line every 10 s."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc recover FILE`: copy a torn or damaged recording, up to the damage, into a valid file."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run `cloudrc relay`: the emulated link for TCP connections, or for a topic of ROS 2."""
 
 from __future__ import annotations

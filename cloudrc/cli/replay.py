@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc replay RUN`: write the 3-D replay of a recorded flight as one page, and open it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc report RUN`: write the report of a recorded run again, and print a summary."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc robot`: check a robot before it flies."""
 
 from __future__ import annotations

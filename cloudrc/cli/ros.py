@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run `cloudrc ros bridge`: a node of ROS 2 beside a flight, which shows and steers the robot."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc run`: fly an experiment, write a recording and a report, and print the verdict."""
 
 from __future__ import annotations

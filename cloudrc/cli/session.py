@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc up` and `cloudrc down`: a session, in which missions fly one after the other.
 
 A session consists of the processes of a local run. It has no mission of its own: the robot waits on

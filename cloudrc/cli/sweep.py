@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc sweep`: fly a grid of settings with several seeds; write a row of numbers per flight."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Carry out the actions of `cloudrc sweep`, and `cloudrc run --seeds N`: a sweep of one point."""
 
 from __future__ import annotations

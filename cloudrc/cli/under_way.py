@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find the run on this machine that a command or a call refers to."""
 
 from __future__ import annotations

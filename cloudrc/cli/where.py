@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Flags that say which flight is meant: a run on this machine, an API, a release in a cluster.
 
 The token of teleop's API is read from a file, because a token on the command line would appear in

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Cloud's end of the tunnel: receive telemetry and send a command in every period.
 
 Cloud asks for a session with HELLO datagrams, and uses the epoch (session number) that world

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compute each command from the newest telemetry with estimator, predictor and controller.
 
 If a plug-in raises an exception, or returns values that are not finite numbers, the loop uses a

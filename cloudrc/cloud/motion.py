@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Models of a robot's motion under velocity commands, with which predictors replay commands."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Send-on-delta: tell which commands are news to the robot, so that cloud sends no others.
 
 A robot that gets no newer command follows the plan of the last one. A command whose plan is nearly

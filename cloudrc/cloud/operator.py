@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Connect cloud to teleop by messages; repeat an emergency stop until the robot has stopped."""
 
 from __future__ import annotations

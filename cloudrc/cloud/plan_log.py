@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Remember the plans of the sent commands, and tell what the plan in use had predicted.
 
 Telemetry echoes the command that the robot follows. The plan of this command has predicted where

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Controller of a robot that stays on the ground."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Judge the values that users' plug-ins return, so that only valid ones reach the robot.
 
 Each function returns the value with plain floats, or raises an `InvalidValueError`, which counts as

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Computing time on cores that the clouds of several robots share."""
 
 from __future__ import annotations

@@ -1,1 +1,3 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Work with a release of the chart on Kubernetes: install it, fly missions, fetch recordings."""

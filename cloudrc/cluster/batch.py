@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fly the flights of a sweep as an Indexed Job; each pod prints the results of its flights as rows.
 
 If a pod is lost, Kubernetes starts another pod, and the same flights give the same rows. Therefore

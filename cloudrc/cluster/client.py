@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Select a Helm release of cloudrc, send requests to its Kubernetes cluster, run kubectl and helm.
 
 Every error of the cluster or of a program becomes a message of one sentence.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find the causes of an ill release, and the remedies, from what its cluster and pods returned.
 
 No function sends a request; `cloudrc.cluster.incidents` observes a release and calls these.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """List the releases of a cluster, each with its link, its state and its mission."""
 
 from __future__ import annotations

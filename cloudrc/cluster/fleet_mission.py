@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Follow the Job of a fleet: a pod per robot, whose completion index is the robot's number.
 
 A watch tells which pods have ended: two requests a second for any number of robots. The metrics of

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Install a release, wait until it is ready, and fly one experiment with it.
 
 A flight installs or upgrades the release, flies the mission by a Kubernetes Job, fetches and merges

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Observe a release: its objects, its metrics, and what happens to its pods in flight."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run Kubernetes Jobs: create, follow and delete them; fly a mission as a Job.
 
 The chart makes the Job of a mission from the release's values, and keeps it in a ConfigMap; the Job

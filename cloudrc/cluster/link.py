@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Change the link of a release in flight, for `cloudrc link set` in a cluster.
 
 First, `send` sends the new profile to the link containers of both pods, by the same request as in a

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Call the API of a release over a forwarded port."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Bring the user's robot and scene to the pods: each becomes a ConfigMap, which the pods mount.
 
 A ConfigMap has no folders and at most 1 MiB. A robot that does not fit needs an image of its own.

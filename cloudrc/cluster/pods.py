@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Access the pods of a release: find them, explain failures, forward ports, fetch files.
 
 A recording grows while it is copied. Its copy may therefore end in the middle of a record, like the

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find the releases of cloudrc: the only one of a namespace, or all of a cluster."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Survey a cluster before an install: permissions, values, admission, quota, nodes, images, DNS.
 
 The pods of the chart are sent to the API server as a dry run, so that Pod Security, LimitRanges and

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The time that cloud computes: files for `cloud.compute_ms`, and cores that robots share."""
 
 from __future__ import annotations

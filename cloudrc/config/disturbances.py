@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define the keys of what the controllers do not know: another robot, wind, errors of sensors."""
 
 from __future__ import annotations

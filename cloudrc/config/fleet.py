@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define the keys of a fleet, and of the cell and the traffic that its robots share."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What a recording keeps of robot and scene, so that its report needs none of the user's files."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Missions of a robot that stays on the ground: its waypoints have the height of the spawn."""
 
 from __future__ import annotations

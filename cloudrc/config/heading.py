@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The yaw of waypoints: not every robot obeys one."""
 
 from __future__ import annotations

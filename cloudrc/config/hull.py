@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The size of a robot: spheres that contain it, for clearance and the check of paths."""
 
 from __future__ import annotations

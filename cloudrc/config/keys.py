@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The keys of a model, as its JSON schema describes them: for errors, completion and tables."""
 
 from __future__ import annotations

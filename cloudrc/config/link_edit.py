@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Change a link profile, as 'cloudrc link set' and the relays are asked to."""
 
 from __future__ import annotations

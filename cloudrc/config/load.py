@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Load an experiment and resolve it: replace names by contents, and add all default values.
 
 A resolved experiment contains its mission, both directions of the link, all parameters of the

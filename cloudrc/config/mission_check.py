@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Check whether the robot can fly a mission in a scene.
 
 Each waypoint must be in the region in which the guard lets the robot fly. The robot must keep a

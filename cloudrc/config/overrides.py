@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Apply settings, such as `--set key=value`, to a document, and complete plug-in parameters.
 
 - A key of both directions of the link, `link.both.delay_ms`, sets the uplink and the downlink.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define the keys of a place where cloud may run, such as the files under places."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Describe problems of a configuration, each in one line: file, key, value, and how to fix it.
 
 The schema provides the texts: type, range and unit of a key, or the key most similar to a typo.

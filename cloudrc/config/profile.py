@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read link profiles: every key with its unit, range and default, and the files that it names.
 
 The name of a key ends with its unit (`delay_ms`). Unknown keys are refused.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """An experiment that is resolved: it contains its mission, and a value for every key."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read what a robot is: its model, and the onboard controller that flies or drives it.
 
 A robot is a folder with the file `robot.yaml`, or the file of a model alone. Shipped robots are the

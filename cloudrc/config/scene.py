@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The scene of an experiment, with the fence that the experiment may give it."""
 
 from __future__ import annotations

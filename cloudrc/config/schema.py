@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define every key of experiments and missions, with its unit, range and default.
 
 The name of a key ends with its unit (`delay_ms`); `cloudrc/assembly.py` and `cloudrc/link/` convert

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The base of all sections of files: strictly typed, described by the texts below the keys."""
 
 from __future__ import annotations

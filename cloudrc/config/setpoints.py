@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read and write the setpoints of a mission: a CSV file with the columns time_s,x_m,y_m,z_m."""
 
 from __future__ import annotations

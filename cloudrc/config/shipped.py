@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find and read configuration files: shipped files by name, other files by path."""
 
 from __future__ import annotations

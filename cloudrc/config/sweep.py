@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read the file of a sweep: a grid of settings of an experiment, each with several seeds.
 
 docs/sweeps.md describes the file. A *point* has one value of each axis.

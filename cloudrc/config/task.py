@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define a task for a class: its files, and the tests and points of each part.
 
 A lecturer's own task has tests by flights alone; formulas are those of the exercise of

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find where in the time line of its link a flight begins."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Decide which requests the console answers: those of its own page, by a user who has the token.
 
 A browser lets every web page send requests to this machine, but it tells whose page sends them

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The controls of the browser that steers: buttons, the target, keys, sliders of the link.
 
 viser reports the release of a button, but not the release of a key. Therefore, while the user holds

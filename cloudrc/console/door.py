@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Listen at the console's address: check every request, switch the robot off, show the plain page.
 
 The door has a thread of its own and does not draw, so that STOP never waits for the scene. It

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Store what a console shows of a flight: the newest pose, the charts of the last 25 s, the trail.
 
 The input is the robot's status from teleop's API. If world and cloud share a clock, the delay of

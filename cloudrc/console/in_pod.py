@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The console in a pod, which has no right to change the link of its release."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Serve the console's page: all browsers show the flight, one browser can control it.
 
 The door (`console/door.py`) serves the page and its STOP, viser draws the scene and the panels.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Show the robot and its surroundings in a browser: `FlightScene`, on viser."""
 
 from __future__ import annotations

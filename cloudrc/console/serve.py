@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Serve the page that shows and steers a flight, until the flight ends."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Carry out what the operator asks for on the page or in a terminal, and watch missions and link.
 
 The emergency stop, the drive and the changes of the link have threads of their own, with their own

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Drive the robot with the keys of a terminal.
 
 A terminal repeats a key while it is held, but never tells that the key is released. A key therefore

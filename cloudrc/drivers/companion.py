@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Start a program of the user with a flight, and end it with the flight."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Limit the processor time of this process, and keep it in step with virtual time."""
 
 from __future__ import annotations

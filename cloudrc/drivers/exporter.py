@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Serve the metrics and the health checks of a process over HTTP, on separate threads."""
 
 from __future__ import annotations

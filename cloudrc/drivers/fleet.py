@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run several robots in virtual time, which act on each other through a cell and shared cores.
 
 Each robot is a `VirtualRun`. It may fly on alone up to the next instant at which others can act on

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read the key file of world or cloud, and reload it in flight: an operator may rotate the key.
 
 The robots of a fleet have keys of their own, derived from one file: the world of one robot thus

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Answer `PUT /link` on a Unix socket, and send it to one: how a running link is changed."""
 
 from __future__ import annotations

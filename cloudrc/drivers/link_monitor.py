@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Monitor the link in flight: every 5 s, compare the received datagrams with the prediction.
 
 World judges the downlink. Cloud judges the uplink and, if world and cloud share no clock, the round

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Tell each change of the link's profile, from the state file of a link process."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run and supervise world, teleop, cloud and the two directions of the link on this machine.
 
 Each of these five is a process. The supervisor (this process) reads the records that they print. It

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run and supervise the robots of a fleet on this machine, and the cell that they share."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find clock, usable cores and Python of the machine; end child processes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run programs in network namespaces, and forward ports of this machine into one of them.
 
 Each namespace belongs to a holder process (`cloudrc/link/exec/holder.py`), which ends every

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run world or cloud as a process: record its data, report to the supervisor, stop on signals.
 
 The process ends on SIGTERM or SIGINT, or when its parent process has ended. Its standard output is

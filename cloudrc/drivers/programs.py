@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run tc and ip, the programs that shape the link by netem."""
 
 from __future__ import annotations

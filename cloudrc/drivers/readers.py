@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Let other programs of this machine read cloud's records during a flight.
 
 A reader has a socket in a folder, usually that of the run's sockets. Cloud sends its records to

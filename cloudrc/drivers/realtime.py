@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run one endpoint in real time on a UDP socket and the machine's monotonic clock.
 
 The loop sleeps until the endpoint's next deadline or the next datagram, whichever comes first.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Record the flight of a real-time process without delaying its control loop.
 
 The loop puts records into a queue of limited length. A thread writes a few records at a time to the

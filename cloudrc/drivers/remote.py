@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Ask a program outside for commands: in lock step in virtual time, in a process in real time.
 
 In real time the process of cloud does no foreign I/O. It exchanges datagrams with a driver process

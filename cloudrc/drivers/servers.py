@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Serve requests on threads: what the small servers of a process have in common."""
 
 from __future__ import annotations

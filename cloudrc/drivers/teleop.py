@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run teleop in its own process, and connect the processes of teleop and cloud by Unix sockets.
 
 No call blocks. A datagram is lost if the socket of the receiver is full or missing. Each process

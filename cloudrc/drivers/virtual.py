@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run world, cloud and the link between them in one process, in virtual time.
 
 The driver handles events in the order of their times, which are integer nanoseconds. If several

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Hash the code and the files behind an environment, as far as its class and arguments tell."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Play one episode of an environment with a policy at the other end of a link."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Judge the rows of an evaluation: what survives, what differs, and what only looks better.
 
 All rows have equal seeds. Those without a network come first, the others by rising round trip.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw the figure of an evaluation, and make its page."""
 
 from __future__ import annotations

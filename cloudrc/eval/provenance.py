@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Say how the numbers of an evaluation were made, so that they can be cited and repeated."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Play the episodes of an evaluation, keep their rows, and summarise them."""
 
 from __future__ import annotations

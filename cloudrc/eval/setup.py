@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What an evaluation plays: an environment, a policy, and the conditions of the network."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Say which part of its link's time line an evaluation has met."""
 
 from __future__ import annotations

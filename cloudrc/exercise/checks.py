@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Score the parts of a task: formulas on given samples, and flights in virtual time.
 
 A flight that scores one part flies with the experiment's own plug-ins for all other parts, so that

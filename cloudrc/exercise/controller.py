@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Controller, part 3 of the exercise: a PID controller for each of x, y and z.
 
     e = setpoint - estimate      eq. (4), but with the sign that converges

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Delay estimator, part 1 of the exercise: the mean of all loop delays so far.
 
 With each new delay tau_n, after k delays:    tau = tau + (tau_n - tau) / (k + 1)

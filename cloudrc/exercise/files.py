@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The files of a task in a student's folder."""
 
 from __future__ import annotations

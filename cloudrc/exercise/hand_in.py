@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Score one part of a hand-in, in a process of its own: `python -m ... PART DIR TASK LIMITS`.
 
 Each test is a line of JSON on the process's stdout; what the student's files print goes nowhere. If

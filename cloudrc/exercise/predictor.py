@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Part 2 of the exercise: predict the state of the robot when the next command acts, tau later.
 
     position = p + v tau      velocity = v + a tau, with a = 0, because a is not measured

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The score of a student's files: for JSON, as a table, for Gradescope; those of a class as CSV."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Score a student's files, each part of the task in a process of its own.
 
 So a crash costs the points of this part only. The process is no sandbox: a student's file has all

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Watch the processes of a part: it and its children share limits, and end together.
 
 On Linux, a child whose parent has ended becomes a child of the process that watches, so that it is

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compute the current metrics of one process from its records.
 
 The errors of predictions and of delay estimates are correct even if world and cloud do not share a

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Store the values of live metrics: histograms, and numbers by the values of their labels.
 
 The thread of the control loop stores and counts records, in 1 to 2 us per record. The thread that

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define all Prometheus metrics: name, type, meaning, labels, and the processes that expose them.
 
 Names follow the rules of Prometheus: prefix `cloudrc_`, base units, `_total` at the end of

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Inject faults into flights in virtual time, and check how the system reacts.
 
 scenarios/             named faults with checks of the required reaction

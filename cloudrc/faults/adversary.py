@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Model dishonest clouds, which have valid keys and can send any command.
 
 Each kind of dishonest cloud is a policy. A policy knows what an honest cloud knows: the newest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fly an experiment in virtual time with faults, and check the invariants after every step.
 
 World, cloud and their driver are those of production; processes and teleop are models.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Inject the faults of a schedule into the link, into commands and into the parts of a flight."""
 
 from __future__ import annotations

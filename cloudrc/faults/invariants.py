@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Safety invariants, checked in every 2 ms step of a flight, independently of the guard.
 
 fence      The robot's base stays inside the fence while its actuators are on. After a collision or

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define a named fault, its checks and their result as JSON; measure flights for the checks."""
 
 from __future__ import annotations

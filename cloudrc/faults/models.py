@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Simulate processes, clocks and teleop in virtual time, so that faults can be injected."""
 
 from __future__ import annotations

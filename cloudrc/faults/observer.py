@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Observe a robot: keep each step of its physics; check the invariants stale, latch and hold."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The limits of robot and scene that invariants compare with, and the breach of an invariant."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Describe the faults of one flight and their times: chosen at random, or from a YAML file."""
 
 from __future__ import annotations

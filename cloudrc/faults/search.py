@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fly random or hostile schedules of faults for a time, and count which invariants they break."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fly with the faults of one schedule in virtual time, and return the broken invariants.
 
 An operator orders one mission after another, and acknowledges each landing and emergency stop. The

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Represent a robot by spheres, and compute their distance from tubes and other obstacles.
 
 A tube is an ideal hollow cylinder with flat ends. The physics builds each tube from flat staves,

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The fence of the guard: the box that the robot's base may not leave.
 
 A fence is a fact of a scene: `<custom><numeric name="fence" data="x0 y0 z0 x1 y1 z1"/></custom>`

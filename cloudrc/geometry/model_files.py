@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find the files that a robot or a scene consists of, without MuJoCo.
 
 `mujoco.mju_getXMLDependencies` misses a height field in `meshdir`, and all files under `strippath`.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """List the obstacles of a scene: declared tubes and plates, and all others."""
 
 from __future__ import annotations

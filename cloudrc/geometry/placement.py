@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Check whether a robot can fly to a position: the guard's limits, and obstacles in the way."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read the tubes, the plates and the floor of a scene from its MJCF file, without MuJoCo.
 
 For this reader, the MJCF file repeats the ideal shapes as numbers: `<custom><numeric name="..."

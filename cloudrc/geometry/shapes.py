@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Describe what robot and scene look like: surfaces of triangles, with colours.
 
 The recording of a flight has these shapes in the attachment `shapes.npz`, so that the flight can be

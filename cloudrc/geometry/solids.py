@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Convex bodies, and the distance of points from them."""
 
 from __future__ import annotations

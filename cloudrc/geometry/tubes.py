@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Build the surfaces of a tube, a hollow cylinder of a scene."""
 
 from __future__ import annotations

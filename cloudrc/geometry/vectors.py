@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Small functions of vectors and orientations, in plain floats."""
 
 from __future__ import annotations

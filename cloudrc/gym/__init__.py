@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Environments of gymnasium whose policy is at the other end of a link, in virtual time.
 
 The import registers `cloudrc/Networked-v0`, `cloudrc/Steps-v0`, `cloudrc/Pipes-v0` and

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compute what a link asks for: the mean delay and the loss of messages.
 
 Over a time line, it is that of the part which an episode meets. Without a rate, packets are the

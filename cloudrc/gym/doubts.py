@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Say in words what makes the messages of a robot useless: few arrive, or they are too many."""
 
 from __future__ import annotations

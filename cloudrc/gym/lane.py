@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Send the messages of one direction over the link of an episode, and count them."""
 
 from __future__ import annotations

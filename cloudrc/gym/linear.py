@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A linear plant with noise: networked control of it has closed forms (docs/closed-forms.md).
 
     x+ = A x + B u + w,  y = C x + v,  reward = -(x' Q x + u' R u)

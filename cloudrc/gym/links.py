@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Choose the link of each episode: always one, one of several, or what a function returns."""
 
 from __future__ import annotations

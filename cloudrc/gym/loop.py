@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Carry observations and actions of one robot over a link, in the ticks of its environment.
 
 The world never waits: a tick is a step of the environment, and what is late is late. The policy is

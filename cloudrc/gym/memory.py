@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What a policy may remember, beside its observation: its age, its step, its own last actions.
 
 With the actions that are under way, the state of a world behind a constant delay is complete again

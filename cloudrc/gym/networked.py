@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Put a link between an environment and its policy: a wrapper for any gymnasium environment."""
 
 from __future__ import annotations

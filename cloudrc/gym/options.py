@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Check and complete how an environment and its policy are connected."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Environments that `gymnasium.make` makes by name, once `cloudrc.gym` is imported."""
 
 from __future__ import annotations

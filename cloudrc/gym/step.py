@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find the time of a step of an environment, and who tells it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The testbed's own robots as environments: a policy flies them in place of the cloud's controller.
 
 World, guard, tunnel and missions are those of every flight in virtual time. So the true path is,

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Copy, check and measure observations and actions of any space."""
 
 from __future__ import annotations

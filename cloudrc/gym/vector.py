@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Put a link between each robot of a vector environment and its policy."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A radio cell: one medium that serves the packets of many robots one after another.
 
 Which packet leaves next is decided when the packet before it has left. So the cell is no function

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The request that changes a running link, `PUT /link`, and its answer, as bytes of HTTP.
 
 The process that shapes a direction answers on a Unix socket, which only its own user can open. A

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Say in words what makes a link useless: no packet arrives, or its rate is too low."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compute the random impairments of each packet with a counter-based random number generator.
 
 Seed, direction, session (epoch) and kind of datagram select a stream of random numbers. The counter

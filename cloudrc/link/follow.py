@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Follow changes of a running link: a new profile, or a new address of the other pod (the peer).
 
 In a cluster the ConfigMap is the source of truth. Kubernetes may need a minute to copy it to a

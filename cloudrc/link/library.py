@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Open the model of a link for any program: no clock, no socket, no process.
 
 A program asks when each of its packets arrives, in its own time. The answer depends on seed,

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compute when each packet arrives in one direction of a link.
 
 The model has no clock, no socket and no stateful random generator. Runs in virtual time and the

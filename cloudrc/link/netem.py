@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Shape one direction of the link in the kernel: `tc` configures the pod's outgoing interface.
 
     interface > prio 7400: --+-- bands 1-3: everything else, as before

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A bottleneck that serves packets at recorded instants, as mahimahi replays a cellular link.
 
 At each opportunity 1500 bytes may leave. What a packet leaves over serves the packets that wait

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define the keys of a link profile, and compute the conditions of a direction over time from them.
 
 The classes of the keys are plain; the models in `config/profile.py` inherit keys, ranges and texts

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read a link profile: a shipped one by its name, a file by its path, or a mapping with its keys.
 
 The classes in `link/profile.py` say which keys there are, and which values each may have.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Keep the packets that are in flight on a link, in the order of their arrivals.
 
 Runs in virtual time, the relay and the warnings before a flight use the same queue. It has no clock

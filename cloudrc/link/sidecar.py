@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Shape one direction of the link: choose relay or netem, follow changes of profile and peer.
 
 The sidecar delays the datagrams that one end of the tunnel sends, its own end: the end in the same

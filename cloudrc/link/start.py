@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find where in its time line a link begins: at a given time, or at one drawn at random.
 
 Both directions begin at the same time. The draw depends on seed, episode and stream alone, so what

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Publish the state of one direction of the link in a file: its shaper, profile and last change.
 
 The state file is in the folder of the route file. World or cloud on the same machine reads it and

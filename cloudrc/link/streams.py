@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Send many packets through the model of a link, and compute statistics of their delays."""
 
 from __future__ import annotations

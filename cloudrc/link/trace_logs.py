@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read the delays and losses of real links from logs of ping and irtt, and from CSV files.
 
     LC_ALL=C ping -D -O HOST

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read and write traces: CSV files of delay and loss over time, which link profiles use.
 
 A trace has the columns `time_s` and `delay_ms`, also in other units, and may have `loss`. Each row

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How long packets wait for a medium, by queueing theory."""
 
 from __future__ import annotations

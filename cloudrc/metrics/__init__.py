@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compute the metrics of a recorded flight; each metric is one number with a unit.
 
 `measure` finds and computes metrics; the metrics of cloudrc are rows of tables in `flight`,

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Age of information over time, exactly: it rises, and a fresher update lowers it.
 
 Source: S. Kaul, R. Yates, M. Gruteser, "Real-time status: how often should one update?", IEEE

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Metrics of the control loop: estimation, prediction, tracking, round trips and timing."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Tell how far a counter of world, cloud or link rose in a part of a recording.
 
 Counters count from the start of their process, so that a session's counters go on from mission to

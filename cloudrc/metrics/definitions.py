@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define the quantities that a flight's report, its live metrics and the console all show.
 
 `QUANTITIES` has a row for each quantity with a value per record: the row is all that report, rows

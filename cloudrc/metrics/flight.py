@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define `Flight`, a recording of one mission, and the metrics of the robot's motion.
 
 A mission begins when world obeys the operator's request to start it; all times count from there.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Metrics of each direction of the link: delays, losses, late datagrams, and the relay's counters.
 
 The mean delay includes datagrams that were too late to be used.

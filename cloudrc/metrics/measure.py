@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find metrics by their names or files, and compute all metrics of a recorded flight."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Metrics of the mission: waypoints, contacts, steady error, time in HOLD, and faults."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compare the path of a flight with that of another one, however long each of them took."""
 
 from __future__ import annotations

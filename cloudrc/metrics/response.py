@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Metrics of the response to steps of the setpoint: overshoot, settling, errors, and stability.
 
 A step begins when the setpoint changes and ends when it changes again, or when the mission ends.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fit a first-order model of the velocity loop to a recorded flight.
 
 Per axis, the model is v' = (K u(t - d) - v) / T with time constant T, dead time d and gain K. The

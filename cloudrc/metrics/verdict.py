@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Judge a mission: success, failure, invalid or interrupted.
 
 The first matching outcome of this list is the verdict:

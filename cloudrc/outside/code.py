@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Users' code: load it from a file, and tell its failures from those of cloudrc.
 
 It runs as Python runs it. What it raises, also SystemExit, is its own failure, which names its file

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Paths that a user names: results never replace what is there, and secrets are read whole."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Tell what takes long, while it takes long."""
 
 from __future__ import annotations

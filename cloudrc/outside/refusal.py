@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The error about a value from outside: its place, the value, and what is valid."""
 
 from __future__ import annotations

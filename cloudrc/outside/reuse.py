@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compute what an experiment, or many points of a sweep, share only once: parsed files, checks.
 
 Outside of `reuse_results` nothing is kept, because a user may edit a file between two commands of

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read tables: CSV files whose first line names the columns with their units, such as `delay_ms`.
 
 Commas, semicolons or tabs separate the cells; numbers have a decimal point. Empty lines and lines

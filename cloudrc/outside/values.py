@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Numbers from outside: one type reads texts, objects and arrays, and says which are valid.
 
 All doors read numbers with a `Quantity`, so they agree on what a number is: `1e3` is one, and

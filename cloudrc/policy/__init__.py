@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The wire of openpi's policies: observations up, chunks of actions down, over a WebSocket.
 
 The server speaks first: one map, its metadata. Then the client sends an observation and the server

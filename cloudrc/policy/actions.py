@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Check the actions of a policy, wherever it runs."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The address and the API key of a policy's server."""
 
 from __future__ import annotations

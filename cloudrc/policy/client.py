@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Ask a policy's server over a WebSocket."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Pack maps with numpy arrays as msgpack, in the form of openpi; never as pickle.
 
 An array is a map with the keys `__ndarray__`, `data`, `dtype` and `shape`, which are bytes. A

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Load a policy from a file of the user."""
 
 from __future__ import annotations

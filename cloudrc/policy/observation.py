@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Make the observation that a policy wants from that of an environment."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Serve a policy of the user over a WebSocket."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run the radio cell of a fleet as a process: the packets of all robots pass through it.
 
 Each world and each cloud sends to a port of its own, which names the robot. The process records

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run world or cloud as a process of a local run or a pod."""
 
 from __future__ import annotations

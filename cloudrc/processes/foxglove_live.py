@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Serve a flight to Foxglove: `cloudrc up --foxglove` starts this module as a process.
 
 It is a second reader of cloud's records, for which cloud never waits.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Shape one direction of the link of a pod or local run, in a process of its own.
 
 PUT /link on the Unix socket of --control changes the link. GET /link.json on the metrics port

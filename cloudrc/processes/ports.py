@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Open the ports of a process, and warn if other machines can reach them; repeat an action."""
 
 from __future__ import annotations

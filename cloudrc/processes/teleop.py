@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run the process that stores and commands missions and serves the API."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Record flights in MCAP files, and read the files as arrays.
 
 Only the modules `ros`, `writer` and `reader` need the packages of `cloudrc[record]`.

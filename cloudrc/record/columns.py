@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read a recording as one table per topic, with one array per column.
 
     recording = Recording.read(path)

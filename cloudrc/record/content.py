@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the file of a recording contains; the reader makes it, and the writer stores it."""
 
 from __future__ import annotations

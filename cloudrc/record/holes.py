@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Know the holes of a recording: the times in which its messages are lost.
 
 The recorder notes them, the reader finds the lost end of a torn file, and the metadata of a copy

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Encode and decode the messages that cloudrc exchanges with live nodes of ROS 2.
 
 Frames and units are those of a recording: poses are in the frame `world`, and the twist of an

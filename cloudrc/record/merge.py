@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Merge the recordings of world and cloud into one recording of a mission, on world's clock.
 
 Only the stamp of a cloud message is converted; other times in the message stay on the clock that

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read an MCAP file up to its end, or up to its first damage.
 
 A killed process leaves a file without an end, and a bad disk damages one. What comes before is

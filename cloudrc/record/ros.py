@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Convert rows of topics to ROS 2 messages in CDR encoding, and back.
 
 ROS stores quaternions as `xyzw` and the velocity of an odometry in the body frame; cloudrc uses

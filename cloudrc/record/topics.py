@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define the topics of a recording, and convert records to rows of topics.
 
 Each record gives a row in one or more topics. A topic is a table with the column `stamp_ns` and a

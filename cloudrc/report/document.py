@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Build the documents report.json and environment.json."""
 
 from __future__ import annotations

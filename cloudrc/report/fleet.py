@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Summarise the flight of a fleet: each robot, the worst and the median one, cell and cloud."""
 
 from __future__ import annotations

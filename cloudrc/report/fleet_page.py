@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Make the page report.html of a fleet, with its figure."""
 
 from __future__ import annotations

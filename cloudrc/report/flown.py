@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find the robot and the scene of a flight: what the recording has of them, else their files."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read the folder of a run to write a new report.
 
 The source of the report is `mission.mcap`. If another program has filtered, cut or replaced this

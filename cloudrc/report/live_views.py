@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Make the messages of a recording from cloud's records during a flight, for Foxglove's layout."""
 
 from __future__ import annotations

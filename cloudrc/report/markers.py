@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Make ROS markers of the robot, its surroundings and paths, as RViz and Foxglove show them.
 
 A marker moves with its frame: the robot with `base_link`, the robot that cloud predicts with

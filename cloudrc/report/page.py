@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Make the page report.html with the verdict, the main numbers, all numbers and figures.
 
 The page is one file with all pictures. It uses the reader's fonts and loads nothing from a network.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Make the replay of a flight: the 3-D scene over time, as HTML that loads nothing from a network.
 
 The report contains the replay as a section; `cloudrc replay` writes it as a page of its own.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw a robot alone, from the shapes of its compiled model."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Summarize a report in a few lines of text."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Make topics for viewers: Foxglove and Lichtblick show them without settings.
 
 Each moving thing is a frame on `/tf`: `base_link` is the robot's true pose, `estimate` the pose

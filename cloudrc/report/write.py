@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Write the report of a run: report.json, environment.json and, if wanted, page and figures."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Build a robot in its scene: model, onboard controller, actuators and guard."""
 
 from __future__ import annotations

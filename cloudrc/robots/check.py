@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Check a robot: read its facts from the compiled model, and move it in virtual time.
 
 The robot moves without a network, a cloud and a guard: it stands or hovers, follows a step of the

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read the shapes and the numbers of an experiment's robot and scene."""
 
 from __future__ import annotations

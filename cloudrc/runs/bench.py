@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Measure how much processor time the closed loop needs on this machine.
 
 The measured flight is that of the experiment `paper`. For comparison, another workload replays only

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """List the names that an experiment may use, with a description of each."""
 
 from __future__ import annotations

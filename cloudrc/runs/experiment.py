@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Load the experiment of a command or of a call, and advise on settings that do not fit."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fly a fleet: build its robots, its cell and its shared cloud, and judge each.
 
 The folder of a fleet has a folder for each robot, `robot-0` and so on, with all that a run has but

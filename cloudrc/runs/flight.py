@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fly one experiment in virtual time without writing files; return its verdict and metrics."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fly an experiment, record the flight, and write the report.
 
 A run is a folder: the experiment as config.yaml, the recording as mission.mcap, and the report.

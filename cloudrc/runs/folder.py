@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Make the folder of a run or of a sweep."""
 
 from __future__ import annotations

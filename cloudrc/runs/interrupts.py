@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Interrupt a command on SIGINT, SIGTERM and SIGHUP, and remember that it was interrupted.
 
 A library may catch the exception of the handler: the code of MuJoCo that starts in its import turns

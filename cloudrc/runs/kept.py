@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Reports of a release's missions: the Job of a mission keeps one, anybody else fetches one.
 
 With the chart's `recordings`, a volume has world.mcap and cloud.mcap of the pods, and the folder

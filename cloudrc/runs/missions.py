@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read missions, post one to the API of teleop, and follow it to its verdict."""
 
 from __future__ import annotations

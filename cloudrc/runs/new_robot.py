@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Write the folder of a new robot: a description, a model and a test, which the user changes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Hash the user's files that an experiment names, and find those that changed since a flight."""
 
 from __future__ import annotations

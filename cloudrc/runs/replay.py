@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Write the 3-D replay of a recorded flight as one page."""
 
 from __future__ import annotations

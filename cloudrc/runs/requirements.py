@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """List optional dependencies, the modes that need them, and how to install missing packages."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Check a robot: its facts, a flight, what must change, and its picture."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read the last mission of a session (`cloudrc up`) that has ended.
 
 The recordings of world and cloud contain all flights of the session; `mission.mcap` and the report

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The simulator: MuJoCo, and all that knows it.
 
 `engine` imports MuJoCo. `scene` compiles a robot in a scene, `simulator` moves it. `bodies`,

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read what a flight controller needs to know of a robot from its compiled MuJoCo model.
 
 Mass, centre of mass, inertia, gravity, and what each actuator does come from the model alone.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read the bodies of a scene, and the size of a robot, with MuJoCo."""
 
 from __future__ import annotations

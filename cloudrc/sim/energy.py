@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Measure the mechanical energy of a robot's rotors, from their thrusts and speeds."""
 
 from __future__ import annotations

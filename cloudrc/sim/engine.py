@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Import MuJoCo, and turn its errors into those of cloudrc."""
 
 from __future__ import annotations

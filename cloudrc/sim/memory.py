@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Give compiled code what it needs of MuJoCo: its library, addresses, and where contacts may be."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What a robot brings besides its model: an onboard controller, and the physics of its actuators.
 
 World knows no kind of robot. In every physics step it hands the controller the readings and the

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Model the true robot and the wind, which guard, onboard controller and cloud do not know."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The interface between the physics and the onboard part: readings of ideal sensors.
 
 The onboard part (`guard`, `sensors`, the robot's controller) sees nothing else of the physics

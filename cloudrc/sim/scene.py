@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compile a robot and a scene into one MuJoCo model.
 
 Both may be a user's own. Whether a controller can fly the robot is the controller's to say.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read the shapes of a robot and its scene from the compiled model."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Simulate the physics: turn the commands of the actuators into readings and contacts.
 
 The module writes to MuJoCo's arrays with `struct` and memory views. For four elements, this takes a

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read the driven wheels of a robot from its compiled MuJoCo model."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find how many robots a cell and a cloud carry: the largest fleet in which all robots succeed.
 
 Success need not fall steadily with the size of the fleet. So the search finds the cliff with one

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Show how many robots a cell and a cloud carry: a table and a figure."""
 
 from __future__ import annotations

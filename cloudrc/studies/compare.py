@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compare two settings, A and B, by pairs of flights that differ in nothing else."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Format the result of a comparison of A and B for people."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Measure how long a controller computes a command, for `cloud.compute_ms`."""
 
 from __future__ import annotations

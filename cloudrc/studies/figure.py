@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw the figure of a sweep: for each point, medians and success rate with 95 % intervals."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fit the model of a robot's velocity loop to a recorded run."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Try values of a key: is the loop stable with a value, and do the flights settle in time?"""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Say where the controller should run, by flights with disturbances at several places.
 
 In calm air a place hardly matters: a controller that knows the robot needs no news. So the flights

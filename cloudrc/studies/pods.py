@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fly flights of a sweep in the pods of a cluster, which run `cloudrc sweep rows`."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find the values of a key at which a question is answered with yes, such as "is the loop stable?".
 
 All values are multiples of a resolution, so that the search is over whole numbers. A coarse grid

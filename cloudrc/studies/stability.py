@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Decide whether a control loop is stable: fly one step of the setpoint, and see if it dies out.
 
 Two flights with the same random numbers differ in the step alone: both hover at a point, and in one

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Keep a sweep in a folder: rows, summary and tables of its flights.
 
 docs/sweeps.md describes the files.

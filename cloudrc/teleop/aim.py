@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Choose the setpoint: at a waypoint, on the way to it, on a track, driven by hand, or here."""
 
 from __future__ import annotations

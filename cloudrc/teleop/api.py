@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Serve teleop's HTTP API: pass requests to the mission service, and answer in JSON.
 
 Only the thread of teleop's loop may call the mission service. The API therefore queues each call on

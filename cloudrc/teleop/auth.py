@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Check the bearer token of every API request, count requests, and log commands.
 
 A caller with an operator's token may do everything; a caller with a reader's token may only read.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compute where a moving setpoint, the carrot, is at any time.
 
 The carrot moves in a straight line to a waypoint with a trapezoidal speed profile: it accelerates

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Call the HTTP API of teleop, the process that commands missions.
 
 The API is at http://HOST:PORT, which needs a token, or at unix:PATH, a socket file that only its

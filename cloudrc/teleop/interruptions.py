@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Tell the interruptions of a mission, as they begin and end: silence of telemetry, and HOLD.
 
 All times are times since the mission began [s].

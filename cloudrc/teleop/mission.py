@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fly missions: turn the operator's commands and telemetry into setpoints, requests and events.
 
               start                    start seen             every waypoint reached

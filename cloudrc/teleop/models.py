@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define the requests and answers of the API, and check the missions and points in requests.
 
 The OpenAPI document is made from these models. A request has the form of a section of a

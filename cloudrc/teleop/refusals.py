@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define why teleop cannot do what a request asks for."""
 
 from __future__ import annotations

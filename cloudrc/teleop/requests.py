@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Send operator requests over a lossy link: repeat a request until the robot has carried it out."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Follow the robot's way from waypoint to waypoint: lead it, and detect when it has arrived."""
 
 from __future__ import annotations

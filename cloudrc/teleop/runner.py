@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fly the missions of a store one after the other, and write down what happens.
 
 A new teleop process continues the mission of the earlier process at the same waypoint, unless world

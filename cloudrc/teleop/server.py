@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Serve an application over HTTP in a thread: teleop's API, or the console's page."""
 
 from __future__ import annotations

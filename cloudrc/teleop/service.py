@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Queue missions, carry out the operator's commands, and report the robot's state."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Store missions and their progress in an SQLite file; read them after a restart of teleop.
 
 One row holds a mission's order and status; each event changes the status. A transaction returns

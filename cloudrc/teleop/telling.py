@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Describe missions and the robot for people, from answers of teleop's API."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Show the robot's state to the operator: the newest telemetry, its age, and what comes next."""
 
 from __future__ import annotations

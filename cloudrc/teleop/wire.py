@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define the plan of a mission, and encode the messages between cloud and teleop.
 
 Each datagram is a JSON list: the name of the message's type, then its fields in order.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fly an experiment beside the same experiment without a network, and compare both paths.
 
 Where the setpoint waits for the robot, the cost of control cannot be compared: a badly damped

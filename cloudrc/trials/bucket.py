@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Keep rows in a bucket of S3, or of a store with the same API, such as MinIO.
 
 Address and credentials of the store come from the variables of the AWS tools, such as

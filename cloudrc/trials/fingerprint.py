@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Name what a row depends on: equal fingerprints mean equal rows.
 
 That is the code of cloudrc, the settings, the person's own files, and the installed plug-ins.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A fleet as a trial: fly it, judge its robots, and measure the median and the worst one.
 
 If `until_failure` is set, the flight ends once a robot has failed that succeeds alone. A robot that

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Plan the flights of a sweep: each point is loaded and checked before the first flight."""
 
 from __future__ import annotations

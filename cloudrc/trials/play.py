@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Play trials in several processes; each gives a row, and only those without one are played."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Keep the result of each trial as a row: one line of JSON in a file of its folder.
 
 A row has no wall-clock times, so equal trials give equal rows.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Summarise rows: verdicts, medians, success rates, and differences in pairs of equal seeds."""
 
 from __future__ import annotations

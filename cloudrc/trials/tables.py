@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Write rows as a flat table, a line per trial: CSV or Parquet."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run work in worker processes, which end with this process."""
 
 from __future__ import annotations

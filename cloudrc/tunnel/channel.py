@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Decide by the counter of each datagram whether it is to be used, is late, or is repeated."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Encode messages as datagrams and decode them, with a fixed little-endian layout per kind.
 
 docs/wire.md describes the layout. `session` encrypts the bodies and makes the tags. The functions

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The common part of both ends of the tunnel: identity, session, outgoing datagrams, records."""
 
 from __future__ import annotations

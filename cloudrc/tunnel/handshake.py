@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The handshake that opens a session: world's side, cloud's side, and the texts of failures.
 
     cloud                                      world

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Pre-shared keys, the keys that HKDF-SHA256 (RFC 5869) derives from them, and the key file."""
 
 from __future__ import annotations

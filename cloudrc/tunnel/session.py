@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Encrypt outgoing datagrams and verify incoming datagrams with the keys of a session.
 
 A datagram changes no state before its tag is verified. Counters restart with every session, except

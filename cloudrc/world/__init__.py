@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The robot's end of the tunnel: physics, sensors, guard and low-level controller.
 
     tunnel > guard > onboard > actuators > simulator > readings > sensors > tunnel

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """World's end of the tunnel: receive commands, fly the robot and send telemetry.
 
 A datagram takes effect after all steps of the simulation that are due before its arrival. The

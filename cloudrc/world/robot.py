@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The robot: in every step, guard and onboard controller turn readings into commands."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Add bias and seeded noise to the odometry that goes to cloud.
 
 Guard and onboard controller use the true state, without errors.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Build the package with colcon."""
 
 from setuptools import setup

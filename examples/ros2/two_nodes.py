@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Two plain nodes that count messages: a talker that numbers them, and a listener.
 
 python two_nodes.py talker [COUNT] [HZ] [BYTES] [best_effort]

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the tests with a real ROS 2 share: `make ros2-test` runs them."""
 
 import os

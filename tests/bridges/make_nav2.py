@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Make a package nav2_msgs with one action: python -m tests.bridges.make_nav2 FOLDER.
 
 There is no wheel of nav2_msgs. The wheels of rosidl generate the code, g++ compiles it.

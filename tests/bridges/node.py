@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A node of ROS 2 that is right, or wrong in one way: python -m tests.bridges.node KIND."""
 
 import os

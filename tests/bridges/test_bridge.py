@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the bridge of a flight to ROS 2 publishes and asks for, without a ROS."""
 
 import time

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc relay ros` puts a link between two topics: `make ros2-test` runs these tests."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A node of ROS 2 controls the robot: `make ros2-test` runs these tests in a real ROS 2."""
 
 import json

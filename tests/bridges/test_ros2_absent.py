@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What ROS 2 needs, and its messages, without a ROS."""
 
 import sys

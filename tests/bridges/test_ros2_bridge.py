@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A plain node of ROS 2 sees a flight and steers it: `make ros2-test` runs this in a real ROS 2."""
 
 import subprocess

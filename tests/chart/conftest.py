@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Render the chart without helm.
 
 gotpl is the template engine. As in helm, values are merged with the defaults and checked against

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Experiment and link profile reach the pods in files that the package reads."""
 
 import pytest

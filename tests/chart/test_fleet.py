@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A fleet: StatefulSets, one cell, one Job; a single robot renders as before there were fleets."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The link's mode follows the namespace; `helm test` verifies the link."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Missions as Jobs of the chart, of its CronJob and of `cloudrc mission run`; each flies once."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Prometheus finds the metrics by annotations, or by the objects of its operator."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The user's robot and scene are ConfigMaps that each container with the experiment mounts."""
 
 import pytest

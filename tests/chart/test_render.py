@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Every values file renders to valid Kubernetes objects, as with helm, and to those in rendered/.
 
 `rendered/default.yaml` has the objects of the default values. The other files have what other

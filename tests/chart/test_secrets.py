@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Key and tokens are made once and kept; a container mounts no more than it needs."""
 
 import base64

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The pods satisfy Pod Security "restricted", except a link with netem."""
 
 from tests.chart.conftest import (

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Values of earlier charts: `helm upgrade` takes them, reused as a whole and over new defaults."""
 
 import tarfile

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The schema is closed, the defaults are valid, and a wrong value is named."""
 
 import pytest

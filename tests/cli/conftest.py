@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The working folder of each command, and calls of commands."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc capacity` finds the capacity, and goes on where it ended."""
 
 import json

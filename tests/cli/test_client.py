@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The API behind a proxy, or another program at its address: it works, or one line says why not."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc compare`: flights of A and B in pairs, a table and one sentence that answers."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Completion: a script for each shell that knows commands, options and shipped names."""
 
 import shutil

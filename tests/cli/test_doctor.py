@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The doctor: every problem has a fix; only what the mode needs blocks it."""
 
 import tomllib

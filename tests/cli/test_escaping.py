@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Text from files and from the API is escaped: it cannot control the terminal or fake a line."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc faults`: results are told, and what was flown before an interrupt is kept."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How `cloudrc mission` and `cloudrc link set` find a run on this machine."""
 
 import contextlib

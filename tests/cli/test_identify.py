@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc identify`: known models are found, bad recordings are refused by name."""
 
 from itertools import accumulate

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """SIGINT, SIGTERM and SIGHUP interrupt a command; none gets lost in an import or a library.
 
 MuJoCo turns every exception in its import into an ImportError, so that a sweep stored rows with the

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc key`: make a key, rotate it, drop the old one."""
 
 import os

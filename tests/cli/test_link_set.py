@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc link set`: settings become a profile, take effect, and are read back."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc link`: its actions, traces of runs and logs, pictures of profiles."""
 
 import pytest

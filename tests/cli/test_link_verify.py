@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc link verify` of a release, which `helm test` runs, over real HTTP."""
 
 import json

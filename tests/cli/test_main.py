@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The command `cloudrc`: help, errors in one line, exit codes, broken pipes."""
 
 import subprocess

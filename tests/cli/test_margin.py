@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc margin KEY`: the values with which the loop is stable, and with which it settles."""
 
 import pytest

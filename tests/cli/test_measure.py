@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc measure compute`: the file of computing times, which cloud.compute_ms takes."""
 
 import json

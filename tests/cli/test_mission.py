@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc mission` against the real API: its output and exit codes."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Output: aligned columns, readable numbers, colour only on request, progress of a flight."""
 
 import io

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """World and cloud as commands: flags, addresses, recordings, sizes, stopping at start."""
 
 import argparse

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc replay`: the page of a run or of a recording, and refused input."""
 
 import pytest

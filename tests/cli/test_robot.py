@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc new robot` and `cloudrc robot check`."""
 
 import runpy

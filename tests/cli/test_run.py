@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc run` and `cloudrc report`: refused input, output, and the folder of a run."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc run` with a fleet: a folder for each robot, and one report of all."""
 
 import csv

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc up` and `cloudrc down`: a session flies missions, is steered, ends, and is reported."""
 
 import json

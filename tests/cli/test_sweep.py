@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc sweep`: the same table whether interrupted, in shards, in pods or at once.
 
 `cloudrc run --seeds` prints one table of all seeds, or of the finished ones, and writes a sweep.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Commands over a time line: what they say, and what rows and reports have."""
 
 import json

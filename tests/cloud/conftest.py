@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Provide a control loop without endpoints, telemetry for it, and its commands."""
 
 from cloudrc.cloud.controllers import Controller, ControlOutput

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Cloud's compute time: its statistics, the CPU limit, and when a command leaves."""
 
 import json

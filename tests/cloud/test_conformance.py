@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Check every plug-in file against the contract of its kind."""
 
 import importlib

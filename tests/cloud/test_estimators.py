@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Delay estimators by hand-worked numbers, in seconds."""
 
 import pytest

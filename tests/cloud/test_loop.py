@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The control loop: delays, when it freezes, and that it goes on whatever a plug-in does."""
 
 from functools import partial

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Model predictive control: its optimum, its limits and its prediction."""
 
 import sys

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Send-on-delta: which commands cloud sends, and who hears of the others."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What cloud tells teleop, and the alarm: a stop is repeated until the guard is in ESTOP."""
 
 import pytest

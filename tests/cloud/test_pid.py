@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The PID controller by hand-worked numbers."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Plans: the controller's future commands, by the predictor's model and the future setpoints."""
 
 from math import nan

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the plan in use had predicted for the instant of an odometry."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A controller steers a robot on the ground in the plane; a vertical velocity is refused."""
 
 import pytest

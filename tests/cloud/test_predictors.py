@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Predictors by hand-worked numbers."""
 
 from math import pi, sqrt

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Predictors that replay commands: the times of the commands, and numbers worked by hand."""
 
 from itertools import pairwise

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A fake Kubernetes API server with objects in memory, a fake teleop, and fake programs."""
 
 import base64

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The Job of a sweep is created once, its log is read, and its failures are named."""
 
 import base64

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A release is selected; requests and programs fail with an error of one line."""
 
 import pytest

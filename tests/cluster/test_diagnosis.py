@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What a release suffers from is found in what its cluster and its pods returned."""
 
 import re

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc doctor --mode cluster` says "can run" if and only if `cloudrc run` can."""
 
 import shutil

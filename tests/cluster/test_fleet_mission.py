@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Missions of a fleet on the fake API server: one Job, one watch, one summary."""
 
 from itertools import cycle

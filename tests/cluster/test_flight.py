@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc run --mode cluster` from the flags to the report, on a fake cluster."""
 
 import json

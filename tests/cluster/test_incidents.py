@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What happens to pods in flight is told: events, killed containers."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Jobs of missions on the fake API server: created, followed, deleted."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc link set` in a cluster: pods, ConfigMap, messages and permissions."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc mission` in a cluster: its target, checks, output and exit codes."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The user's robot and scene reach the pods as ConfigMaps, or one line says why they cannot."""
 
 import shutil

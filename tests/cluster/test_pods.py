@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Failures of pods are explained, ports and pages forwarded, tokens read and never printed."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Which release a command means: the named one, or the only one of the namespace; never a guess."""
 
 from contextlib import contextmanager

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc doctor --cluster` says what would stop an install, and leaves nothing behind."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The error message of an experiment that cannot be loaded; files that are read once."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """One error lists all problems of a file, each with its place, its reason and what to do."""
 
 import re

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Every key of the schema can be reached: a wrong type is refused there."""
 
 import json

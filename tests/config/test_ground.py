@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Missions of a robot on the ground: two numbers are enough, heights are refused with a word."""
 
 from functools import partial

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A waypoint may have a yaw only if the robot obeys one; robot.yaml says whether it does."""
 
 from math import radians

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The link of a release: a profile, the name of one, or the link of the experiment."""
 
 import pytest

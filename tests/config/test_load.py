@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Experiments are resolved, values override each other in order, and a dump loads again."""
 
 import hashlib

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Two valid settings together load, or are refused by a line that names one of them.
 
 A pair may fail although each of its settings loads alone, for example because a derived value is

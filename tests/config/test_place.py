@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A place gives link, speed and cores; a key that is given wins over it."""
 
 import pytest

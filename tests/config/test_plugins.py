@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Plug-ins are found by name, entry point or path; an error lists the known names."""
 
 import sys

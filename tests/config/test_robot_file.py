@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Limits and size of a robot in robot.yaml; a wrong value is one line with file, line and key."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The limits of the guard come from the robot; an experiment may lower them."""
 
 import re

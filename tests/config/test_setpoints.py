@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Setpoints over time: what is written can be read."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The start of a flight's time line: keys, hashes, and what is told."""
 
 from dataclasses import replace

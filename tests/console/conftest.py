@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Sessions with a console, statuses of the robot, and an API that a test answers."""
 
 import subprocess

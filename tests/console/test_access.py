@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The console answers its own page with its token, nobody else: over HTTP and by WebSocket."""
 
 import base64

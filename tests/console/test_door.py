@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The door answers without viser: STOP, the plain page, and what a browser may send."""
 
 import json

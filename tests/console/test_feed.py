@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the console shows follows from the statuses of the robot."""
 
 from math import isnan

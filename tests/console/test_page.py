@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The console in a browser, on a session of real processes."""
 
 import io

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The 3-D scene: its colours, and the nodes that it shows."""
 
 import matplotlib

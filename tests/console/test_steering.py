@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the operator asks for on the page reaches teleop and the link."""
 
 import time

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Keys of `cloudrc mission drive`."""
 
 import curses

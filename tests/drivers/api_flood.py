@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Flood teleop's API with requests for a second, as a separate process.
 
     python api_flood.py URL TOKEN RATE

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fixtures: a pair of Unix sockets, this machine's speed, and a release of three processes."""
 
 import json

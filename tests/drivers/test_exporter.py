@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The exporter: valid text in bounds, probes on one port, hostile clients, CPU throttling."""
 
 import select

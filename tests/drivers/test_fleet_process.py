@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A fleet in real time: pairs of processes that share a cell, or have links of their own."""
 
 import json

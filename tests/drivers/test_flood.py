@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A flood of requests to the API does not disturb the control loop in another process."""
 
 import json

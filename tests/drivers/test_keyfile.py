@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """An end reads its key file at the start, and follows it in flight."""
 
 import os

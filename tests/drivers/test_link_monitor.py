@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The monitor of a link in flight, with simulated arrivals of the tunnel's datagrams."""
 
 from math import nan

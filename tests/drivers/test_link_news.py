@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Changes of the link in flight become sentences for the mission's log."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Flight files, and the supervisor of a local run: feeds, sockets, deadlines, the key."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Local mode with real processes that are interrupted, killed or stopped; its operator and link."""
 
 import json

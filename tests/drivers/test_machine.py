@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The number of usable cores follows the affinity and the CPU limits of the control groups."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """An end as a process: its end, its feed, and what it records of the link and the clock."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Readers of cloud's records: each gets all records, or knows how many it has lost."""
 
 import pytest

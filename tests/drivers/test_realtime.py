@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The real-time driver: addresses and routes, sockets, stalls and floods."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The recorder never blocks and survives all disk errors; what a pod records."""
 
 import errno

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """World, cloud and teleop as processes that are killed, frozen or ended in flight."""
 
 import signal

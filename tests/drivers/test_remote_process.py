@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Real time: a program outside controls the robot, started by `cloudrc run --with`."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Teleop and cloud over Unix sockets: nothing blocks, and either may restart."""
 
 import threading

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The API of a teleop process with few open files: idle connections lock nobody out."""
 
 import json

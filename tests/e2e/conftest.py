@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The cluster and the release of the end-to-end tests; helpers that read and command them."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Pods beside the release: a foreign pod that tries all ports, and an allowed Prometheus."""
 
 import json

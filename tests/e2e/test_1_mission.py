@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A release in a restricted namespace flies the paper's mission by a Job; metrics and access."""
 
 import math

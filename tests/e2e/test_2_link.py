@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The link of a release: delays, changes in flight, verdict; CPU and memory of the release."""
 
 import json

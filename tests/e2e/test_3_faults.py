@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Faults in flight: pods and a Job deleted, a rotated key."""
 
 import base64

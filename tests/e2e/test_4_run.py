@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The images; `cloudrc run --mode cluster` is like a run in virtual time; another robot drives."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """CPU limits throttle containers, metrics show this, and a run slower than real time is invalid."""
 
 import json

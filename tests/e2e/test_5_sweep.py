@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A sweep in pods gives the table of a sweep on this machine, even if pods and client are lost."""
 
 import csv

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The paper's applications as nodes of ROS 2 in the cloud pod fly as the built-in ones do."""
 
 import json

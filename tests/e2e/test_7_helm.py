@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The commands in helm's notes work, and `helm test` passes."""
 
 import shlex

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc doctor --release` and `mission status` name what a release suffers from."""
 
 import base64

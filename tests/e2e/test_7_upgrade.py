@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A release is upgraded and rolled back in flight; one of an earlier chart restarts."""
 
 import subprocess

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The page of a release, in a browser, through a forwarded port."""
 
 import subprocess

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A fleet of three behind one cell: one Job, a verdict each, and the cell as in virtual time."""
 
 import json

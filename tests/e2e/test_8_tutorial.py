@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The tutorial on a cluster works, in a namespace of its own."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Uninstalling leaves only Secrets."""
 
 from tests.e2e.conftest import NAME, eventually, helm, read

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The file of a policy, which holds the pole of CartPole if a test gives no other."""
 
 import pytest

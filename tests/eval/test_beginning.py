@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How an episode begins and what the policy remembers, in `eval` as in `Networked`."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """An episode of changed files is another episode: its key differs."""
 
 import sys

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Evaluations: episodes over a link, their rows, tables and pages."""
 
 import json

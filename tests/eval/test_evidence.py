@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What rows of an evaluation tell: survival, tests, pooled means, and doubts."""
 
 from math import comb

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Which folders an evaluation goes on with."""
 
 LAW = "def infer(observation):\n    return {'actions': [[0]]}\n"

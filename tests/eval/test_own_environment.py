@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Environments of a user: where they lie, what their arguments are, what they return."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """An evaluation says how it was made, and how to cite it."""
 
 import sys

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What `cloudrc eval` keeps and prints beside success and return."""
 
 import csv

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What an evaluation tells of the time line that it met."""
 
 import json

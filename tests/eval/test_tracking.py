@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The programs of docs/tracking.md log what an evaluation has found: with small fakes."""
 
 import runpy

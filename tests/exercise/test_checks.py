@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The checks of the exercise: full points for the solution, none for the files to fill in."""
 
 import csv

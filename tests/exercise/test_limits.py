@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Memory and processes of hand-ins: each row is there, whatever they take, and none is left."""
 
 import csv

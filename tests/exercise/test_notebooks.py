@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The notebooks run from the first cell to the last, and open where their badges say."""
 
 import json

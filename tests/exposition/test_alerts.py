@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Each fault fires exactly its alerts of the chart."""
 
 import re

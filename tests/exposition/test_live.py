@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Current metrics of a process: histograms and counts of a flight, peer, mission, absent values."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The table of metrics: names by the rules, closed label sets, an entry for every count."""
 
 import re

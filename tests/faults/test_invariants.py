@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The invariants find each breach; that flights without a breach have none is tested in flight."""
 
 from functools import cache, partial

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The named faults: each passes, and fails if its promise is broken."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Schedules of faults: in files, and random ones."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """One schedule, flown: what it is checked for, and that a broken part is found."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Endpoints without robot and loop; flights in virtual time; a world and the test's own cloud."""
 
 from collections import Counter

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Captured datagrams are refused in the next run."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The same experiment and seed give identical records, on any wall clock."""
 
 import os

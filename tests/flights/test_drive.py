@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Driving by hand over a link: latency, an operator who is lost, stops, and the flight again."""
 
 from math import radians

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """World without a link: when commands act, and what happens after a stall."""
 
 from itertools import pairwise

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """One configuration over all networks: plans make the fast mission independent of the delay."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Robots of a fleet act on each other through the cell and the shared cloud alone."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Cloud is silent or killed while the robot is in a pipe: it holds, then finishes the mission."""
 
 from functools import cache

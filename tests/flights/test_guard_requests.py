@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Operator requests reach the guard, which confirms only those that it acts on."""
 
 from math import nan

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Model predictive control flies every robot over a slow and lossy link, closer to the path."""
 
 import pytest

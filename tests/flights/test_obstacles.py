@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The robot flies straight into a body of a user's scene: the verdict names the body."""
 
 import sys

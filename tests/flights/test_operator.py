@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What teleop says reaches the robot in its own session only; an emergency stop in any."""
 
 from types import SimpleNamespace

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The missions and their required numbers, in virtual time; `-m full` flies more seeds."""
 
 import pytest

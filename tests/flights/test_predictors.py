@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Predictors that replay commands: their errors at fast gains, and long links."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A trace of a flight's delays gives the same delays and losses when it is replayed."""
 
 import numpy as np

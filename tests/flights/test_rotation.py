@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A key file is rotated in flight; both ends read it at different times, in either order."""
 
 from itertools import pairwise

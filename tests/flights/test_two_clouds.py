@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Two clouds and one robot: which cloud has authority, and that no command is reverted."""
 
 from itertools import product

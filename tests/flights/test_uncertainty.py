@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Each uncertainty changes the flight as it should."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Clearance equals distances that were computed by hand, published, or computed pose by pose."""
 
 import math

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The fence comes from the scene, or from world.fence_m; a wrong one is one line."""
 
 import pytest

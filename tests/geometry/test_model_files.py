@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """All files of which a robot or a scene consists are found."""
 
 import pytest

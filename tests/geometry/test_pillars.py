@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The shipped scene `pillars`: its bodies are obstacles, and a drone flies between them."""
 
 import cloudrc

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Positions too near to a wall, straight ways through a wall, and missions with one of them."""
 
 import math

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Tubes, plates and floor are read from a scene file; the error names an invalid number."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Surfaces of robot and scene: closed, turned outwards, and the same after a file."""
 
 import numpy as np

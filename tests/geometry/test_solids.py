@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The solids of a user's scene are where MuJoCo has its geoms."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Small environments that tell what they were given."""
 
 import gymnasium

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How a robot executes chunks of actions that arrive late."""
 
 import gymnasium

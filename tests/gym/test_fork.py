@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The task on which a policy's answers disagree: executors keep the order of their publication."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A linear plant, and the closed forms that it reproduces."""
 
 import gymnasium

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Messages of any size: the packets of which they are made, and what of them arrives."""
 
 import random

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A link between any environment and its policy: ticks, delays, repeatability, bad input."""
 
 import copy

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The examples of docs/gym.md and of docs/train.md run."""
 
 import pytest

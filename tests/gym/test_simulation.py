@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The link between environment and policy equals a simulation that is written from its rule alone.
 
 The rule is in docs/gym.md. The simulation shares no code with cloudrc.gym: it takes the fates of

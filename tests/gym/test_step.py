@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The time of a step of an environment: who tells it, and what is refused."""
 
 import gymnasium

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The testbed's robots as environments fly the true path of its flights, bit by bit."""
 
 import gymnasium

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Episodes over a time line: where each begins, what was asked, and links that vary."""
 
 from math import isnan

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Vector environments: each robot has a link of its own, in each way of automatic reset."""
 
 import gymnasium

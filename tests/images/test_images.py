@@ -1,4 +1,6 @@
-"""Dockerfiles and locks: pinned versions, and small images."""
+# SPDX-License-Identifier: Apache-2.0
+
+"""Dockerfiles and locks: pinned bases and versions."""
 
 import re
 import shutil

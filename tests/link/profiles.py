@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Profiles in SI units, for short tests. They are not checked."""
 
 from dataclasses import replace

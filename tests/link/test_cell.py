@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A cell serves the packets of many robots one after another."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Changes of a profile, by ConfigMap and by a request, and of the peer's address."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The link as a library: imports, bits of the flights, streams, tables, profiles, bad input."""
 
 import re

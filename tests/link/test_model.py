@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The model of a direction: random draws, queue, order, time line and statistics."""
 
 import random

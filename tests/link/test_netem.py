@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """netem with a fake kernel: arguments of tc, set-up, restart, time line and removal."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """netem of the kernel, measured between two network namespaces."""
 
 import os

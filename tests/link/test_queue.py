@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The packets in flight: copies, losses and a full queue. Simulated loops notice a wrong order."""
 
 from cloudrc.link.model import LinkDirection

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The sidecar's decisions and its state, with shapers that only record their calls."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Where a time line begins: numbers by hand, who shares a start, and capacity traces."""
 
 from math import sqrt

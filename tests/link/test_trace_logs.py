@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Logs of ping, irtt and CSV: units, losses, directions; unused rows are counted."""
 
 import json

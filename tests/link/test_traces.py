@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Traces are read and written; an invalid trace is refused with file and line."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Synthetic flights with known numbers.
 
 The robot flies at 1 m/s along x from the origin at a height of 1 m, with 25 telemetries and

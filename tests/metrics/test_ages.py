@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Ages at the actuator: computed by hand, and step by step."""
 
 import pytest

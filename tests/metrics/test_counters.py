@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The growth of counters, which go on from mission to mission, in a part of a recording."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Losses, reordering, and errors of predictions and delay estimates.
 
 They are computed by hand, by a full count, and from a flight's ground truth. The same records give

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A flight of which messages are lost: no number and no verdict says more than what is left."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Every shipped metric: numbers computed by hand, and its contract on any recording."""
 
 from dataclasses import replace

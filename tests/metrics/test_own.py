@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A user's own metrics: found by path or installed, measured by a run, checked before it."""
 
 import json

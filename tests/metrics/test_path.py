@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The distance between two paths depends on where they lead, not on how fast the robot flies."""
 
 from types import SimpleNamespace

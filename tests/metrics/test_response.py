@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The response to steps: against second-order systems, whose overshoot and settling are known."""
 
 from math import cos, exp, pi, sin, sqrt

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Each rule of the verdict: what breaks it, its time and place, and the order of outcomes."""
 
 from dataclasses import replace

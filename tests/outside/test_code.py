@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Modules beside a plug-in: its import statements find them."""
 
 import logging

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Every door reads the same numbers: flags, keys of files, columns, the API, results of plug-ins.
 
 The tests find flags and keys by walking them, so that a new one is tested by itself.

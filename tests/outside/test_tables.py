@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Tables: heads with units, separators, and what is refused with its file and line."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Numbers from outside: what is one, and what the error says."""
 
 from math import inf

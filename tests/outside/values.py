@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The values that every door must read alike: texts and objects, each with the number it means."""
 
 from decimal import Decimal

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Servers of policies for tests: ours, and one like openpi's, which behaves as a test says."""
 
 import asyncio

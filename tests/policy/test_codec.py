@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The codec of openpi's wire: what passes, and what is refused."""
 
 import msgpack

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A program outside controls the robot over a WebSocket, in lock step in virtual time."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Client and server of openpi's wire, over loopback."""
 
 import shutil

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Helpers: random records, records of a short flight, and files written by other programs."""
 
 import heapq

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Columns and hash depend on the records alone, from memory and from a file."""
 
 import hashlib

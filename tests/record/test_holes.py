@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A recording knows the times in which its messages are lost, and every copy of it knows them."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The recordings of world and cloud are merged on world's clock, with the offset's uncertainty."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A file is read or copied up to its end or first damage; other kinds of files are named."""
 
 import io

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """ROS messages contain the values of the rows, in the conventions of ROS."""
 
 import math

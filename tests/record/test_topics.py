@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The topics contain all values of the records, with their names and units."""
 
 import re

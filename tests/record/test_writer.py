@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The file is a valid MCAP, and only recording needs the packages for it."""
 
 import gc

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """report.json and environment.json: their keys, absent values, and no names of users."""
 
 import getpass

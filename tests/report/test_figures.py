@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Every flight can be drawn, also with little data; only cloudrc decides the style."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The report of a fleet: worst and median robot, and whether two would have met."""
 
 import numpy as np

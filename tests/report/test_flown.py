@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A run is drawn and reported from its recording, without the user's files of robot and scene."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The folder of a run gives the same report again, or an error, and then stays unchanged."""
 
 import json

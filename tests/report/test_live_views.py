@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Messages for Foxglove from cloud's records during a flight."""
 
 from rosbags.typesys import Stores, get_typestore

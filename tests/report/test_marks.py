@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Figures show the delays of the link profile, and mark changes of the link and HOLD."""
 
 import math

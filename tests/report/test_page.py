@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The page: one file without network requests, with text, numbers and figures."""
 
 import re

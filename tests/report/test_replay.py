@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The replay: its content, its size, and its movement together with the figures in a browser."""
 
 import json

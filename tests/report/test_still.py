@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The still picture: an obstacle hides the path behind it, and a short flight is drawn."""
 
 from io import BytesIO

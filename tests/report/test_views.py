@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Topics for viewers show robot, scene and path; a report ignores these topics."""
 
 import json

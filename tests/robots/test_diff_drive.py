@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A robot with driven wheels goes where the wanted velocity points; unfit models are refused."""
 
 from math import atan2, cos, degrees, hypot, pi, radians, sin

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """An onboard controller that fails: the robot stops, the verdict names file and line."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A robot is a folder: description, model and onboard controller; it needs no edit elsewhere."""
 
 import pytest

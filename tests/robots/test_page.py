@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The commands of docs/robot.md work, one after the other."""
 
 import re

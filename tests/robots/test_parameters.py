@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Parameters on board, a robot unlike its model, and wind, for every robot."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Predictors with a model take it from the robot, or refuse the robot by name."""
 
 import json

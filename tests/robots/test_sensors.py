@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A robot's own sensors: `robot.yaml` names them, and every reader knows their names."""
 
 import numpy as np

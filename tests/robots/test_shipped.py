@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Each shipped multirotor flies the same missions over the same links."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Each function of a user's file is called in one guard: its failure is one error with its line."""
 
 import pytest

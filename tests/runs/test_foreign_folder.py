@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc sweep run --out` does not overwrite what a user has written."""
 
 import pytest

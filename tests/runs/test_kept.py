@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The Job of a mission keeps a report beside the recordings that the pods still write."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """No flight is flown by two commands into one folder at the same time."""
 
 from contextlib import nullcontext

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A run is repeated from its config.yaml: files that changed since its flight are named."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """No output and no file of a flight contains its key or its token."""
 
 import base64

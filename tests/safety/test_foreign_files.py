@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Files from somebody else: cloudrc waits for no pipe, limits sizes, and follows no link."""
 
 import os

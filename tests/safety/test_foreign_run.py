@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A run's folder from somebody else: reading it executes none of its code."""
 
 import json

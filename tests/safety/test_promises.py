@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Every promise in docs/promises.md has a test, and every promise mark names a promise there."""
 
 import re

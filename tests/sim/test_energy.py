@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The energy of rotors is that of a hover computed by hand, and absent if a part is unknown."""
 
 from math import sqrt

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The true robot differs from its model as the keys say, and the wind has its statistics."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Robot and scene are those of docs/reference/plant.md; bad files are refused; GL is not needed."""
 
 import os

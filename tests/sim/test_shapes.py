@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Shapes come from the compiled model, for every type of geom, with its colour."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Rotors and drag follow their formulas, contacts are found, replay is equal bit by bit."""
 
 import pytest

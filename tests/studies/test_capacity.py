@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The capacity is the largest fleet in which all robots succeed that succeed alone."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A comparison uses the metrics that both flights of a pair have."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The figure of a sweep: its axes, its bands, and pairs from the same rows."""
 
 import json

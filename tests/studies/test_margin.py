@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What a search for a margin tells about the values that it tries."""
 
 from cloudrc.studies.margin import Asked, Margin

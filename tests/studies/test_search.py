@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The search for the range of values in which an answer is yes."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The judgement of stability, against a linear model of the loop and against known responses."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A folder has one sweep; its tables follow the order of the grid, whatever flew first."""
 
 import csv

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A server that a test answers, and plain requests."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The keys of an experiment or a profile, as their JSON schemas describe them."""
 
 from cloudrc.config.keys import forms, keys_of

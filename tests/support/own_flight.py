@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A flight with files of one's own: robot, scene and predictor."""
 
 import shutil

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The blocks of code in the pages of docs, and the commands in them.
 
 A reader saves the files of a page, and types its blocks of `bash` and `sh`. A comment in front of a

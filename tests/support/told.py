@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Telemetry of a robot that stands still, as world records it."""
 
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A robot and a lossy link for teleop, a store that may fail, and the real API on a free port."""
 
 import json

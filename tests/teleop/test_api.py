@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The API over HTTP, as its clients meet it."""
 
 import asyncio

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Who may do what, the gate before the API, and the log of who commanded what."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The carrot: its motion, when it waits at the robot, and when it leaves a waypoint."""
 
 from math import dist

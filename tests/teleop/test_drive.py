@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Driving by hand: the moving setpoint, its limits and its end, and what an operator may do."""
 
 import os

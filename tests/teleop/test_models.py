@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Orders to the API: what cannot be used is named, and no way leads through a pipe's wall."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The mission machine under any order of verbs, flights, silences and restarts."""
 
 from contextlib import nullcontext

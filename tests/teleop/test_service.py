@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Missions as a service: keys, the queue, the operator's hand, restarts, and what is shown."""
 
 import re

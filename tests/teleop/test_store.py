@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The store of missions: what is on the disk is known, whatever happens to process and disk."""
 
 import os

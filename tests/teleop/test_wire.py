@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Datagrams between cloud and teleop: every message comes back as it was, nothing else does."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A waypoint with a yaw is reached when the robot is there and faces the yaw; else any yaw does."""
 
 from math import cos, pi, radians, sin

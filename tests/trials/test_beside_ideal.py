@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A mission whose setpoint waits for the robot: how far is its path off that over an ideal link?"""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Pods keep rows in a folder or in a bucket of a real server of S3's API, and find them again."""
 
 import json

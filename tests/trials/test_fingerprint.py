@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The key of a flight takes in the versions of installed plug-ins, of metrics, too."""
 
 import sys

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A grid becomes points with keys; a problem is refused with its file and line.
 
 A file of flights gives the same flights in a pod that has none of the user's files.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Rows survive a crash, and are read as they were written."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Flights with several seeds are summarised in one table."""
 
 from cloudrc.trials.summary import as_table, summarise

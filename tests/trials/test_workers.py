@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Work on several cores: order, killed workers, Ctrl-C."""
 
 import multiprocessing

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A world that answers hellos, for the tests of the handshake."""
 
 from cloudrc.tunnel.codec import Direction, Hello, Kind, decode

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Send hostile datagrams to both ends, and check that none is accepted, raises or is kept.
 
 As a program, this module is a coverage-guided fuzzer with libFuzzer's flags:

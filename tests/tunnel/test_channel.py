@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Channels, compared with a set that remembers every counter."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Cloud's side of the handshake, and the faults that it causes."""
 
 from collections import Counter

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The codec: every message survives a round trip, and everything else is refused."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Both ends send telemetry and commands as bytes, or pass them as objects."""
 
 from collections import Counter

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """World's side of the handshake: cookies, epochs, keys, and which cloud gets the session."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Hostile datagrams: no exception escapes, none is accepted, memory stays flat."""
 
 import platform

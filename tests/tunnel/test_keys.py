@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Key files are parsed and written, and no text shows a key."""
 
 import logging

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A session opens valid datagrams; nothing changes before a tag is verified."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Datagrams have fixed bytes, and agree with docs/wire.md."""
 
 import hashlib

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Helpers of the tests of world."""
 
 from cloudrc.config.robot import find_robot

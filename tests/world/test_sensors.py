@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Odometry for cloud is the truth, or the truth plus seeded noise."""
 
 import numpy as np

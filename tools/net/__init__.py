@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The net: facts of flights, studies and texts, kept before a change and compared after it.
 
     python -m tools.net --write before.json     # on the commit before

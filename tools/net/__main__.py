@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Keep the facts of this tree, or compare them with those kept."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Flights in virtual time: path, commands, verdict, codes, numbers and records."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Numbers of the link, the gym, evaluations, sweeps and studies, and the named faults."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run a command of cloudrc as a user does; keep its exit code and what it says."""
 
 from __future__ import annotations

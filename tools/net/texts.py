@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Texts and files that programs depend on: help, lists, pages, schemas, charts, exit codes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw the pictures of the documentation with MuJoCo: `make pictures`.
 
 They need EGL, for example that of Mesa, and neither a display nor a GPU.

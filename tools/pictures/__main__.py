@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw the pictures of the documentation: `make pictures`."""
 
 from __future__ import annotations

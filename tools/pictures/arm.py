@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw docs/meta-world.png: what `cloudrc eval` has measured with the arm of Meta-World.
 
 Meta-World needs an old MuJoCo, so the numbers are here. Each condition has 20 episodes, of

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Film two flights side by side for the README: the same drone and packets, another predictor.
 
 They are the flights of docs/tutorials/fly-and-steer.md, sections 2 and 3.

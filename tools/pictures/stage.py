@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Render robots in a scene, without a display."""
 
 from __future__ import annotations

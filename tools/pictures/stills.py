@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw the pictures on the pages of robots and missions: docs/robots/ and docs/missions/."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """ROS 2: cloudrc as a node beside a user's nodes.
 
 Only this folder imports rclpy, and nothing imports this folder unless an experiment asks for ROS.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A flight on ROS 2: publish what cloud knows of the robot, and take what nodes ask it for.
 
 Messages are published as CDR bytes, which is faster than by rclpy's Python objects. The stamps are

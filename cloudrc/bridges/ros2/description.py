@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Describe the robot for nodes of ROS 2: a URDF, and how exactly cloud measures it."""
 
 from __future__ import annotations

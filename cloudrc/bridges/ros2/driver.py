@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Real time: a process beside cloud that exchanges messages with nodes of ROS 2.
 
 Cloud never waits for ROS: it exchanges datagrams with this process. The newest answer wins.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Judge link, cloud and robot by cloud's records, for `/diagnostics`."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Virtual time: each estimate waits for the answer of a node of ROS 2 with the same stamp."""
 
 from __future__ import annotations

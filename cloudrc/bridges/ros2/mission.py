@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Say how the mission goes, for a topic, and fly to a pose, for an action of ROS 2."""
 
 from __future__ import annotations

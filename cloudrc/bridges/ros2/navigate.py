@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Serve Nav2's action NavigateToPose with a robot of cloudrc."""
 
 from __future__ import annotations

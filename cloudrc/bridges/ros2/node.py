@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """cloudrc's own node: it publishes what a controller needs, and takes velocity commands.
 
 Messages cross as CDR bytes, which is faster than rclpy's Python objects.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What all nodes of cloudrc in ROS 2 share: a context, QoS, and words about the nodes of others."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Hand the messages of a topic on to another topic, each one late, lost or doubled as a link does.
 
 Messages cross as raw bytes, so they may have any type. Each one is a packet of the link, or several

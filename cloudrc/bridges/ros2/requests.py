@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Carry out what nodes of ROS 2 ask the robot for, with teleop's API."""
 
 from __future__ import annotations

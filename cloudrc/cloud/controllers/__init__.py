@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Controllers compute velocity commands from the robot's estimated state and the setpoint.
 
 Each controller is a plug-in in a file of its own. The file defines `build(**parameters)`, which

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Controller: model predictive control, whose plan is the optimum over the next 0.8 s.
 
 Source: C. Cutler, B. Ramaker, "Dynamic matrix control: a computer control algorithm", 1980; the

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Controller: PID on the position of the predicted odometry.
 
 Source: the paper, eqs. (4) and (5); gains: docs/reference/plant.md, "Cloud controller".

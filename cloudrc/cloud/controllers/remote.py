@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Controller: a program outside of cloudrc, which answers over a WebSocket.
 
 It gets the predicted odometry and the setpoint, and answers with the velocities of this period and

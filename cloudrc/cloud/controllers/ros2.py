@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Controller: a node of ROS 2, which answers each estimate with a velocity.
 
 Source: docs/reference/ros2.md.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Delay estimators compute the horizon: how far ahead the predictor predicts.
 
 Telemetry echoes the stamp of the newest command that world has applied; estimators get the delays

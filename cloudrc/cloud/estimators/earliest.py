@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Estimator: the exact age of the odometry, plus the shortest delay of recent commands.
 
 Use it with plans (`cloud.plan_s`): a plan begins at the earliest possible arrival of its command.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Delay estimator: the exponentially weighted moving average of the loop delay.
 
 With a gain of 0.05, the RMS error at a step of the delay is a third of that of eq. (1) of the

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Delay estimator: the mean of all loop delays so far.
 
 Source: the paper, eq. (1).

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Delay estimator: a running mean of the loop delay whose gain stays at 1/500 after 500 samples.
 
 Source: the authors' published code. Its comments describe a window of 500 samples, but the code

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Delay estimator: the age of the newest odometry plus the average delay of the downlink.
 
 Source: docs/reference/control.md, "Delay estimators": the best of the compared estimators, because

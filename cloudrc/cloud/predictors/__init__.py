@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Predictors extrapolate the newest odometry by the horizon, the time until a command acts.
 
 Each predictor is a plug-in in a file of its own. The file defines `build(**parameters)`, which

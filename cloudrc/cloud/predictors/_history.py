@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Base class of the predictors that replay the sent commands through a model of the robot.
 
 World follows the newest command that has arrived. On world's clock, a command begins at its stamp

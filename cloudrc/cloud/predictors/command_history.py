@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Predictor: replay the sent commands through a first-order velocity loop.
 
 Source: docs/reference/control.md, "Predictors", (e1).

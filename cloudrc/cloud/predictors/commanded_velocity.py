@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Predictor: extrapolate the position with the last commanded velocity.
 
 Source: the authors' published code, which multiplies the delay by the last commanded velocity. The

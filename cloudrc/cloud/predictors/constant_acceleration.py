@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Predictor: extrapolate with the measured velocity and the recent acceleration.
 
 Source: the paper, eq. (3), with the acceleration computed from recent velocities;

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Predictor: extrapolate with the measured velocity.
 
 Source: the paper, eqs. (2) and (3).

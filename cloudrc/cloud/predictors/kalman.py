@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Predictor: filter the odometry with a Kalman filter, then replay the sent commands.
 
 The filter's model is that of `model_based` or of `command_history`. All axes have the same noise,

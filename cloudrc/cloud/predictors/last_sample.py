@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Predictor: use the last odometry without a prediction.
 
 Source: docs/reference/control.md, "Predictors", (a): the baseline for the other predictors.

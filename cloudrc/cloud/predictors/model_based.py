@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Predictor: replay the sent commands through the best model of the robot.
 
 The best model is that of the file `motion` in its robot.yaml, which may contain the onboard

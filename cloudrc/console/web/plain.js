@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: Apache-2.0
+
 const acts = document.getElementById('acts');
 const answered = document.getElementById('answer');
 

@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: Apache-2.0
+
 if (!document.createElement('canvas').getContext('webgl2')) {
   location.replace(`${place}plain`);
 }

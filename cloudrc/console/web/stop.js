@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: Apache-2.0
+
 // The path of the page, with a slash at its end: a proxy may serve the page in a folder.
 const place = location.pathname.replace(/plain$/, '').replace(/\/?$/, '/');
 const form = document.getElementById('stop');

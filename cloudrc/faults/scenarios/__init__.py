@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Faults that are injected in virtual time, in modules for links, ends and intruders."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Faults F13, F15, F17, F23, F25, F27, F28 and F40: faults of processes, commands and missions."""
 
 from __future__ import annotations

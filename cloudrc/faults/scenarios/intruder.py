@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Faults F8, F20 to F22 and F24: damaged, forged, replayed and malformed datagrams."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Faults F1 to F7 and F9 to F12: loss, reordering, copies, clocks, delay steps and jitter."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Executors choose the action that a robot executes in each tick, from answers that arrive late.
 
 An answer is a chunk: actions for successive ticks, the first for the tick of the observation. Each

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Executors that have one question open at a time, and ask again after a loss."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Executor: ask when few actions are left, and merge the answer with them (asynchronous inference).
 
 An action has a number: how many actions had been executed at its observation, plus its place in the

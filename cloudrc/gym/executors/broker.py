@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Executor: play a whole chunk from its beginning, then ask for the next one and wait for it.
 
 This is what a client does that asks only when its chunk is used up.

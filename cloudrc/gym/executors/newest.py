@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Executor: play the newest answer from its first action on."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Executor: as time_indexed, but the policy knows the actions that are executed before its answer.
 
 They travel with the observation. The policy begins its chunk with them and continues from the state

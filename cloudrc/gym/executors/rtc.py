@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Executor: real-time chunking; the policy fits its answer to what the robot will have executed.
 
 With the observation travel the actions that are left, and how many of them the robot executes

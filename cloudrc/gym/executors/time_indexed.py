@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Executor: action i of an answer belongs to the i-th tick after its observation, however late."""
 
 from __future__ import annotations

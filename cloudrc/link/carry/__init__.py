@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Carry packets over the emulated link in real time.
 
     packets > Port  Engine (model, queue, clock)  Port > packets

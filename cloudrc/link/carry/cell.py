@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Carry the packets of many robots through one cell, in real time.
 
 A packet is lost on its robot's link, or waits in the cell, and is then delayed by the link. The

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Send datagrams that may be lost, and receive what has arrived."""
 
 from __future__ import annotations

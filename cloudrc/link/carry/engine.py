@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Take packets in at a port, and hand each one on when the link's model says so.
 
 The engine never hands a packet on before it is due. A sleeping thread wakes 15 to 50 us late; so

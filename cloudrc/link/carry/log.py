@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Note what happened to packets: how late each one left, and its times on the link."""
 
 from __future__ import annotations

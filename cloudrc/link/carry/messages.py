@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Carry messages of any size over one direction of the link: in one packet, or in several."""
 
 from __future__ import annotations

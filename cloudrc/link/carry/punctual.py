@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Let the thread that carries packets wake up in time."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Carry IP packets between two TUN devices."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Forward datagrams in real time, and delay, lose or copy each one as the link's model computes.
 
 A relay shapes one direction of the link:

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Shape the network between two programs: each has a network namespace with one TUN device.
 
     client > [TUN]  TunRelay  [TUN] > server

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Hold one network namespace of `cloudrc link exec`, and run one program in it.
 
 The command starts this module as a process, which enters a new namespace and sends the command a

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read the kernel's tables about the network namespace of this process."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Move this process into a network namespace of its own, with one TUN device (Linux only).
 
 The module uses system calls alone, because a container often has neither `ip` nor `unshare`.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Verify a link: send probes, predict their delays and losses from the profile, and compare."""
 
 from __future__ import annotations

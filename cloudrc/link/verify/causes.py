@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Name the likely cause if the measurements of a link differ from its profile.
 
 Causes that the machine itself shows (by its qdiscs, its counters, or a late shaper) come before

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Predict the measurement of a link with the requested profile, and judge a real measurement.
 
 The random numbers of a relay depend only on seed and counter, so the delay of each datagram through

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Judge what a relay between two programs did, by the times at which packets entered and left."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Send numbered probes through both directions of a link and measure their delays.
 
 One thread sends and receives at both ends with the same clock. The thread takes the time just

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw the figures of a report, without a display, OpenGL or pyplot."""
 
 from __future__ import annotations

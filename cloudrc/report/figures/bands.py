@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw the figure of a sweep: a panel per quantity, a line per setting, an interval per point."""
 
 from __future__ import annotations

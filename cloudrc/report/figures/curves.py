@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw the figures over time: delays, position per axis, and errors."""
 
 from __future__ import annotations

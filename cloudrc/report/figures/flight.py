@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw the figure of the flight: the path from above and from the side, and its clearance.
 
 A robot that stays on the ground has no panel from the side.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw the figure of `cloudrc link show`: delay and loss over time, distribution of the delay."""
 
 from __future__ import annotations

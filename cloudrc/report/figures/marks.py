@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Mark the state HOLD and link changes in figures; compute the delays of the link profile.
 
 A link profile describes the conditions of a direction over time; `cloudrc link set` replaces the

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw a still picture of a flight in its scene, for readers whose browser draws no 3-D."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Define the style of all figures, and `Subject`, the flight that the figures show.
 
 Fonts and sizes suit a paper with two columns. Colour-blind readers can distinguish the colours.

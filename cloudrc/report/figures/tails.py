@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw the distribution of ages: the share of the time or steps with a higher age, 1 - F(x)."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Distribute thrust and torques over the actuators of a multirotor.
 
 The allocation works with accelerations instead of forces and torques, so that gains do not depend

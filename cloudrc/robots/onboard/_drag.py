@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Drag of the rotors of any multirotor, which MuJoCo does not simulate."""
 
 from __future__ import annotations

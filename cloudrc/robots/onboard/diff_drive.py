@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Onboard controller for robots with driven wheels on the left and on the right.
 
 The robot turns its nearer end, front or back, towards the wanted velocity, and drives with that

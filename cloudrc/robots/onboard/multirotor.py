@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Fly any multirotor: a body with a free joint, and actuators that push at sites.
 
 Allocation and hover thrust come from the compiled model, and gains from bandwidths. So one

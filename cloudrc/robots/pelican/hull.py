@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The Pelican as spheres, for its distance from obstacles.
 
 `few` returns an array with a row per sphere: its centre (x, y, z) in the body frame and its

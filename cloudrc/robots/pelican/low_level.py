@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The onboard low-level controller: it makes the robot follow a velocity reference at 500 Hz.
 
 A velocity PID computes the force that the robot needs. Geometric attitude control turns the thrust

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Model of the Pelican and its onboard controller, with which cloud predicts.
 
 The model contains the guard's limits, the velocity PID, the attitude loop, rotors and drag. The

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Onboard controller: the published one, for the Pelican with its arm and four rotors.
 
 Only robots of about its mass are accepted, because gains and allocation are those of its mass,

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The rotors: they turn commanded speeds into thrusts and a drag wrench.
 
 The order of the rotors is always front (+x), left (+y), back, right. The reaction torque about z is

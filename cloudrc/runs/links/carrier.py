@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A link that a command runs, that `cloudrc link set` changes, and that is judged at the end."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Change the link of a run that flies on this machine."""
 
 from __future__ import annotations

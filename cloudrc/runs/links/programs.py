@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run two programs with the emulated link between them, and judge the link at the end."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Report on a link of other programs: the verdict on each direction, and a recording."""
 
 from __future__ import annotations

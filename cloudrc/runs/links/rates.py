@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Make a link profile from the packet opportunities that mahimahi has recorded."""
 
 from __future__ import annotations

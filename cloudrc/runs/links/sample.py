@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Simulate the link alone, to draw a profile and compute its statistics."""
 
 from __future__ import annotations

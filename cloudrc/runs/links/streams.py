@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Carry TCP connections to a server over the emulated link, until a signal."""
 
 from __future__ import annotations

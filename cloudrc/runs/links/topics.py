@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Relay the messages of a topic of ROS 2 over the emulated link, until a signal."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Read measured delays of a link from a run, an MCAP file, a log of ping or irtt, or a CSV file.
 
 The content of the source tells its format.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run a link on this machine, and send probes over it.
 
 A relay runs on loopback; netem runs between two network namespaces.

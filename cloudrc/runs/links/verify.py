@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compare a link with its profile, by probes or in flight.
 
 By probes: start a link on this machine and measure it. In a cluster no probes are sent: world and

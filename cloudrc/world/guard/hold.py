@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Brake, hold a position, land and take off with the onboard sensors alone.
 
 The deceleration falls towards the end of braking. The robot follows the velocity reference with a

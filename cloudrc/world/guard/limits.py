@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Functions that keep a velocity reference within the limits of the guard.
 
 The limits come from world's experiment; no message changes them. `config.load.ResolvedGuard` checks

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The guard: the state machine that decides which commands the robot flies.
 
 The guard stands between the tunnel and the low-level controller, and gives the controller a

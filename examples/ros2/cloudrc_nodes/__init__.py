@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The paper's applications as nodes of ROS 2. They do not import cloudrc.
 
 Each node publishes what one of cloudrc's own applications publishes below `cloudrc/`. The nodes

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run nodes in one process: python -m cloudrc_nodes [NODE ...]; without a name, all of them.
 
 What is not named stays built into cloudrc.

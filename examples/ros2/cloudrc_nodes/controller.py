@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The paper's controller as a node: a proportional controller of the position.
 
 It answers each estimate once the setpoint with the same stamp is there, and copies the stamp. So a

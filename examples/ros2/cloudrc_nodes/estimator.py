@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The paper's estimator as a node: the mean of all loop delays so far, eq. (1).
 
 A delay is a TimeReference: `header.stamp` minus `time_ref`.

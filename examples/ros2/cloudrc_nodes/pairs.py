@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the nodes share: how they hear the messages of one period, and how they run."""
 
 from __future__ import annotations

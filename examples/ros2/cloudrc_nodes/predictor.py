@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The paper's predictor as a node: the robot keeps its velocity, eq. (3).
 
 It needs `--set cloud.predictor=last_sample`: then cloudrc's estimate is the newest odometry, not

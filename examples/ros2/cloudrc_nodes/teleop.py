@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The paper's teleoperation as a node: it leads the robot from waypoint to waypoint.
 
 cloudrc's own teleoperation still starts and ends the flight, and judges it: give both the same

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Start the paper's applications: ros2 launch cloudrc_nodes paper.launch.py [teleop:=false].
 
 An application that is false stays built into cloudrc.

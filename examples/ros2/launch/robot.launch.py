@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Start a session and its bridge: ros2 launch cloudrc_nodes robot.launch.py [experiment:=pillars].
 
 Nodes see the robot and steer it once the session has begun. The launch ends with the session.

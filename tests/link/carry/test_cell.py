@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A cell in real time: it serves the packets of all robots one after another."""
 
 from time import monotonic_ns

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Messages of any size over one direction of the link, as a relay of topics carries them."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc relay tcp` between real sockets of this machine."""
 
 import hashlib

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A direction of a TCP connection over the link, in virtual time."""
 
 import hashlib

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The relay between two programs, over sockets in place of TUN devices, and its verdict."""
 
 import socket

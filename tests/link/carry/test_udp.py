@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The relay over real sockets on 127.0.0.1: in this process, and as a process."""
 
 import json

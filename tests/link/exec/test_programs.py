@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc link exec` with real programs in real namespaces (run by make test-tun)."""
 
 import hashlib

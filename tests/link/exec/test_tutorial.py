@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The tutorial of two programs works, in real namespaces."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Probes and flights over links in virtual time, shaped as by the relay or by netem."""
 
 from dataclasses import replace

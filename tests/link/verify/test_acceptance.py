@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Verdicts and named causes for whole links in virtual time."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Evidence is read from the state, metrics and qdiscs of a link container."""
 
 from cloudrc.link.verify.causes import (

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`link verify` with netem: an honest link, and faults that only a kernel can have."""
 
 import signal

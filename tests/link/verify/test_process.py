@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`cloudrc link verify` over real sockets and processes: verdicts, causes, exit codes."""
 
 import json

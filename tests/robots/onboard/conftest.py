@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Multirotors made of MJCF text, and a flight that runs one controller in MuJoCo, without world."""
 
 from math import cos, hypot, pi, sin

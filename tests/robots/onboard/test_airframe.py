@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the controller reads from a model, and which models it refuses."""
 
 import numpy as np

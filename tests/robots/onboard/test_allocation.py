@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The allocation makes what is asked; where it cannot, the tilt comes first and the yaw last."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A folder with a model and `onboard: multirotor` is a robot that flies in the testbed."""
 
 from contextlib import nullcontext

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """One controller flies multirotors of any size and layout; how well, and how it saturates."""
 
 import numpy as np

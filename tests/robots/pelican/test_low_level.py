@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The equations of the low-level controller give the hand-calculated numbers."""
 
 from math import cos, radians, sin

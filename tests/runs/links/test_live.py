@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A link whose profile changes while it runs says which direction has changed."""
 
 import contextlib

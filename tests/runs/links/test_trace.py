@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A trace of a run, and its report, have the losses of the link, also near the end."""
 
 import numpy as np

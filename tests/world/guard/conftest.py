@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Helpers for tests of the guard: a guard alone, and a flying robot with hostile clouds."""
 
 from math import hypot

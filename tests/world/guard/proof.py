@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Prove what plain Python computes, for all floats.
 
 A proof runs plain Python for all 64-bit floats at once, with z3. A `Symbol` stands for any float.

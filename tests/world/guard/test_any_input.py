@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """For any commands and readings, the guard's reference stays within its bounds.
 
 Each case is one flight. The first reading may be anything; the next one differs from it by little.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The guard with a simulated robot: it brakes, holds, lands, stops, and resists hostile clouds."""
 
 from math import dist, hypot

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Braking, position hold and take-off, with numbers."""
 
 from math import hypot, nan

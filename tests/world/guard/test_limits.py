@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """No limit can be switched off, and the arithmetic keeps them for any float."""
 
 from math import hypot, inf, isfinite, nan

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The guard keeps its promises after every event, in any order of events."""
 
 from math import hypot, nan

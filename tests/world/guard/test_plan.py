@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How the guard flies the plan of a command, and how it trusts nothing of it."""
 
 from math import inf, nan, nextafter

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The guard of a robot that stays on the ground: no heights, HOLD and LAND brake to rest."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Proofs of the guard's arithmetic for all 64-bit floats, NaN and infinity included."""
 
 import pytest

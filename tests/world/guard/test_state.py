@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How the guard is armed, limits commands, holds, lands, stops, and takes off."""
 
 from math import cos, dist, inf, nan, nextafter, radians, sin

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Carry TCP connections over the emulated link without privileges.
 
     client > TCP > StreamRelay > TCP > server

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Compute when the segments of streams cross one direction of the link.
 
 All connections share one bottleneck. Its queue drops nothing: a sender that finds it full waits.

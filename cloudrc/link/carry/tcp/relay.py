@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Accept TCP connections, and carry each over the emulated link to a server.
 
 All sockets are non-blocking.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Carry one direction of a connection that repairs losses over the link, without sockets.
 
 A segment crosses with the delay, the rate and the queue of the link. The far end hands on what

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find or compile the machine code of `step.c`.
 
 Use the first of these files: a file from the wheel, beside this module; a file in the user's cache,

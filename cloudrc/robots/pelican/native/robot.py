@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A robot that runs its usual steps in C, and all others in Python, with the same results.
 
 In a usual step the robot follows a fresh command that the guard need not limit. Python and `step.c`

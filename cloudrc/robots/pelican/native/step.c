@@ -1,3 +1,7 @@
+/*
+ * SPDX-License-Identifier: Apache-2.0
+ */
+
 /* Fly the robot in the usual case: a fresh command that the guard need not limit.
 
    This file is the twin of Python code, and gives the same bits. The Python code is the reference:

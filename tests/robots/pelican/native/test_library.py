@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Where the machine code comes from, and what is said when there is none."""
 
 import sys

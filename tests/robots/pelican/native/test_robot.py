@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Flights in C and in Python have the same bits, whatever the cloud sends."""
 
 import logging
