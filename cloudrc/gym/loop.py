@@ -93,6 +93,7 @@ class RemoteLoop:
             of a tick [s]; at first, it is that of the settings.
         start: What the robot executes without any answer.
         memory: What the policy remembers beside this observation.
+        judge_link: Function that warns of a link that nobody knew before, and says whether it did.
     """
 
     def __init__(
@@ -113,6 +114,7 @@ class RemoteLoop:
         self._settings, self._executor, self._judge = settings, executor, judge
         self.start, self.memory = settings.start, memory
         self._tick = -1  # before the first episode
+        self.judge_link: Callable[[LinkProfile], bool] | None = None
         self._choose, self._chosen = choose, Chosen("", NO_LINK)
         self._stream, self._episode = stream, -1
         self._connect()
@@ -140,6 +142,8 @@ class RemoteLoop:
         if chosen is not self._chosen:
             self._chosen = chosen
             self._connect()
+            if self.judge_link and self.judge_link(chosen.profile):
+                self.judge_link = None  # once
         self._up.begin(self._episode)
         self._down.begin(self._episode)
         self._tick = self._now_ns = self._seen_tick = 0

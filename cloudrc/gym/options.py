@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from math import inf
@@ -166,7 +166,7 @@ def check_kind(env: Any, kind: type, name: str) -> None:
 def warn_of(
     env: Any,
     loop: RemoteLoop,
-    links: Iterable[LinkProfile],
+    links: Sequence[LinkProfile],
     step: StepTime,
     count: int | None,
 ) -> None:
@@ -177,10 +177,19 @@ def warn_of(
     limits = [each.spec.max_episode_steps for each in layers(env) if each.spec]
     longest = min(filter(None, limits), default=inf)
     texts = [text for link in links for text in loop.doubts(link, count or 1, longest)]
+    if not links:  # a function chooses them
+        loop.judge_link = partial(_warn_of_link, loop, count or 1, longest)
     if FILM in step.source:
         texts.append(f"a step takes {step}; if it takes another time, {WAY}")
     for text in dict.fromkeys(texts):
         warnings.warn(text, LinkWarning, stacklevel=4)
+
+
+def _warn_of_link(loop: RemoteLoop, count: int, longest: float, link: LinkProfile) -> bool:
+    texts = [*dict.fromkeys(loop.doubts(link, count, longest))]
+    for text in texts:
+        warnings.warn(text, LinkWarning, stacklevel=5)
+    return bool(texts)
 
 
 def _read_wait(given: float | None, dt: float) -> float:

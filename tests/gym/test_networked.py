@@ -15,6 +15,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from cloudrc.errors import BadInputError
 from cloudrc.gym import Networked, NetworkedVector
+from cloudrc.gym.doubts import LinkWarning
 from cloudrc.gym.linear import Linear
 from tests.gym.envs import Counter, Mixed, both_ways, told
 from tests.support.programs import loaded
@@ -204,6 +205,15 @@ def test_episodes_in_which_no_answer_acts_are_told_when_they_are_made(options, w
         Networked(gymnasium.make("Pendulum-v1", 100), **options)
     with pytest.warns(UserWarning, match=words):
         NetworkedVector(gymnasium.make_vec("Pendulum-v1", 2, max_episode_steps=100), **options)
+
+
+def test_a_link_of_a_function_is_judged_when_it_is_chosen_and_told_once():
+    links = iter([both_ways(10, 10), both_ways(4000, 4000), both_ways(4000, 4000)])
+    env = Networked(gymnasium.make("Pendulum-v1", 100), lambda seed: next(links))
+    env.reset()
+    with pytest.warns(LinkWarning, match="an answer takes 8 s, an episode 5 s"):
+        env.reset()
+    env.reset()
 
 
 def test_what_can_act_is_not_told():
