@@ -52,7 +52,7 @@ GROUPS: dict[str, dict[str, str]] = {
     },
     "cluster (a flight in real time here starts the last four, too)": {
         "key": "make or replace the key that world and cloud share",
-        "world": "the robot: physics, sensors, guard, low-level control",
+        "world": "the robot: physics, sensors, guard, onboard controller",
         "cloud": "the remote controller",
         "teleop": "missions and the operator's HTTP API",
         "cell": "the radio cell that all robots of a fleet share",

@@ -13,7 +13,7 @@ import pytest
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.records import LinkChecked
 from cloudrc.runs.links import verify
-from cloudrc.runs.links.verify import as_text, verify_release
+from cloudrc.runs.links.verify import OF_PROGRAMS, as_text, verify_release
 
 PAGE = {"shaper": "relay", "reason": "", "interface": "eth0", "netems": {}}
 MEASURED = {"ok": 0.0451, "open": 0.0451, "off": 0.0902}
@@ -100,7 +100,8 @@ def test_a_verdict_off_for_a_moment_does_not_end_the_wait(release, monkeypatch):
     release.hears(world="ok", cloud="open")
     undecided = release.ask(0.0)
     assert as_text(undecided).endswith("(--seconds) for mean of the uplink")
-    assert as_text(undecided, more="send more").endswith("(send more) for mean of the uplink")
+    said = as_text(undecided, more=OF_PROGRAMS)
+    assert said.endswith("(send more, or run longer) for mean of the uplink")
     release.hears(world="off", cloud="open")
     later = iter([{}, {}, {"stamp_ns": 6, "world": "ok"}, {}, {"stamp_ns": 6, "cloud": "ok"}])
     clock = SimpleNamespace(monotonic=time.monotonic, sleep=lambda _: release.hears(**next(later)))

@@ -97,7 +97,7 @@ def test_a_pod_that_does_not_run_is_named_with_its_remedy(running, release, plur
         (
             pages(world={TAG: 9.0, **DEAF}),
             "key",
-            "the world pod refuses .* another key; .* rollout restart "
+            "the world pod rejects .* another key; .* rollout restart "
             "deployment/cloudrc-world deployment/cloudrc-cloud",
         ),
         (
