@@ -55,7 +55,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo live live-flight test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly viser lint spdx types api audit bench bench-cell results shown docs site dist owner images kind-load lock clean
+.PHONY: help demo live live-flight test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly viser lint spdx types api audit bench bench-cell results shown pictures docs site dist owner images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -278,6 +278,11 @@ results: $(VENV)/dev ## fly the results of docs/results.md and write them into i
 shown: $(VENV)/dev ## compare the numbers on pages with what their commands give: 15 minutes
 	$(bin)/python -m tools.shown
 
+pictures: $(VENV)/dev ## draw the README's film and the pictures of robots and missions; needs EGL (libegl1): minutes
+	@$(bin)/python -c "import tools.pictures.stage" || { \
+		echo "make pictures needs EGL: apt-get install libegl1 libgl1-mesa-dri" >&2; exit 3; }
+	$(bin)/python -m tools.pictures
+
 docs: $(VENV)/dev ## write the generated tables of docs/, and the chart's schema, table and copied files
 	$(bin)/python -m tools.docs
 
@@ -375,9 +380,3 @@ $(VENV)/deep: pyproject.toml | $(VENV)/dev
 $(VENV)/site: tools/site-requirements.txt | $(VENV)/dev
 	$(bin)/python -m pip install --disable-pip-version-check --quiet --requirement $<
 	@touch $@
-
-.PHONY: pictures
-pictures: $(VENV)/dev ## draw the README's film and the pictures of robots and missions; needs EGL (libegl1): minutes
-	@$(bin)/python -c "import tools.pictures.stage" || { \
-		echo "make pictures needs EGL: apt-get install libegl1 libgl1-mesa-dri" >&2; exit 3; }
-	$(bin)/python -m tools.pictures

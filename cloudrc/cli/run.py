@@ -157,8 +157,9 @@ def _advise(report: Mapping[str, Any]) -> None:
     from cloudrc.metrics.verdict import ADVICE
 
     codes = [failure["code"] for failure in report["failures"]]
-    codes += [robot.get("why", "") for robot in report.get("robots", ())]
-    if any("not_real_time" in each for each in codes):
+    for robot in report.get("robots", ()):
+        codes += robot.get("why", "").split(", ")
+    if "not_real_time" in codes:
         tell(f"the flight did not keep real time: {ADVICE}, or fly with --mode virtual")
 
 
