@@ -37,10 +37,14 @@ DOORS: dict[str, tuple[tuple[str, str], ...]] = {
 line before which he stops (nothing: he reads it to its end)."""
 
 
+def pages() -> list[Path]:
+    """Return all pages of the site, also those outside of docs/."""
+    return sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("charts/**/*.md")})
+
+
 def written() -> dict[str, int]:
     """Return the words of each page that somebody has written by hand."""
-    pages = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
-    texts = {page: MADE.sub("", page.read_text("utf-8")) for page in pages}
+    texts = {page: MADE.sub("", page.read_text("utf-8")) for page in pages()}
     return {page.relative_to(ROOT).as_posix(): words(text) for page, text in texts.items() if text}
 
 
@@ -51,7 +55,7 @@ def words(text: str) -> int:
 
 def made() -> int:
     """Count the words that `make docs` has written."""
-    texts = [page.read_text("utf-8") for page in ROOT.glob("docs/**/*.md")]
+    texts = [page.read_text("utf-8") for page in pages()]
     return sum(words(found[0]) for text in texts for found in MADE.finditer(text))
 
 
