@@ -41,7 +41,7 @@ from cloudrc.record.topics import TOPICS
 from tools import metadata
 from tools.chart_values import added, earliest, make_schema, table_rows
 from tools.dashboards import UNITS
-from tools.guests import FLIGHTS, link, pages
+from tools.guests import OWN_FLIGHTS, link, pages
 from tools.markdown import table
 from tools.site import contents, site_name
 
@@ -318,7 +318,7 @@ def _shipped() -> str:
 
 def _name(kind: str, name: str) -> str:
     """Return a shipped file's name, with a link if it has a page."""
-    return link(kind, name) if kind in FLIGHTS else f"`{name}`"
+    return link(kind, name) if kind in OWN_FLIGHTS else f"`{name}`"
 
 
 def _navigation() -> str:

@@ -23,16 +23,10 @@ from cloudrc.robots.check import SCENE, read_facts
 from tools.markdown import table
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-FLIGHTS: dict[str, dict[str, tuple[str, dict[str, str]]]] = {
-    "robot": {
-        "nano": ("steps", {"world.robot": "nano"}),
-        "pelican": ("paper", {}),
-        "rover": ("pillars", {}),
-        "x2": ("steps", {"world.robot": "x2"}),
-    },
+OWN_FLIGHTS: dict[str, dict[str, tuple[str, dict[str, str]]]] = {
+    "robot": {"pelican": ("paper", {}), "rover": ("pillars", {})},
     "mission": {
         "carrot": ("fast", {}),
-        "hover": ("paper", {"mission": "hover"}),
         "legs": ("fast", {"world.robot": "x2", "mission": "legs"}),
         "pillars": ("pillars", {}),
         "pipes": ("paper", {}),
@@ -40,13 +34,20 @@ FLIGHTS: dict[str, dict[str, tuple[str, dict[str, str]]]] = {
         "steps": ("steps", {}),
     },
 }
-"""Kind -> name -> experiment and settings of a flight that shows it."""
+"""Kind with pages -> name -> experiment and settings of a flight that shows it, if not the usual
+ones."""
 HEADINGS = {
     "free": "it turns at the commanded yaw rate; waypoints may have a yaw",
     "fixed": "its onboard controller holds the yaw at 0; waypoints have no yaw",
     "velocity": "it turns towards its velocity; waypoints have no yaw",
 }
 STOPS = {"land": "it descends and switches off at touch-down", "brake": "it brakes to rest"}
+
+
+def flight_of(kind: str, name: str) -> tuple[str, dict[str, str]]:
+    """Return experiment and settings of a flight that shows a robot or a mission."""
+    usual = ("steps", {"world.robot": name}) if kind == "robot" else ("paper", {"mission": name})
+    return OWN_FLIGHTS[kind].get(name, usual)
 
 
 def pages() -> dict[Path, str]:
@@ -57,7 +58,7 @@ def pages() -> dict[Path, str]:
         for name in shipped.names(kind):
             head = f"# The {kind} `{name}`\n\n{shipped.describe(kind, name)}.\n"
             picture = f"![{shipped.describe(kind, name)}]({name}.webp)\n"
-            experiment, settings = FLIGHTS[kind][name]
+            experiment, settings = flight_of(kind, name)
             flags = "".join(f" --set {key}={value}" for key, value in settings.items())
             command = f"```bash\ncloudrc run {experiment} --mode virtual{flags}\n```\n"
             made = "<!-- made by `make docs`; the picture by `make pictures` -->\n"

@@ -11,9 +11,10 @@ import numpy as np
 from PIL import Image
 
 import cloudrc
+from cloudrc.config import shipped
 from cloudrc.config.robot import find_robot
 from cloudrc.runs.experiment import load
-from tools.guests import DOCS, FLIGHTS
+from tools.guests import DOCS, flight_of
 from tools.pictures.stage import BLUE, GOAL, Array, Stage, View, check_size
 
 SIZE = 720, 420
@@ -37,7 +38,7 @@ VIEWS = {
 
 def draw_robots() -> None:
     """Draw each shipped robot: in the air, or on the floor if it stays there."""
-    for name in FLIGHTS["robot"]:
+    for name in shipped.names("robot"):
         robot = find_robot(name)
         stage = Stage(name, "empty", SIZE, {"robot": None})
         radius = robot.hull_m or REACH
@@ -49,7 +50,8 @@ def draw_robots() -> None:
 
 def draw_missions() -> None:
     """Draw each shipped mission."""
-    for name, (experiment, settings) in FLIGHTS["mission"].items():
+    for name in shipped.names("mission"):
+        experiment, settings = flight_of("mission", name)
         view = VIEWS.get(name)
         write(_flown(experiment, settings, view), DOCS / "missions" / f"{name}.webp")
 
