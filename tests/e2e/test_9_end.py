@@ -16,4 +16,4 @@ def test_uninstalling_leaves_only_the_secrets(installed):
         return sorted(f"{one['kind']} {one['metadata']['name']}" for one in found)
 
     secrets = [f"Secret {NAME}-tokens", f"Secret {NAME}-tunnel"]
-    eventually(lambda: left() == secrets, "only the Secrets are left", 90.0)
+    eventually(lambda: left() == secrets, "only the Secrets are left", 180.0)
