@@ -38,8 +38,8 @@ NAMES = {
 """Page of the repository -> page of the site, where it is not that below docs/."""
 FENCE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(\]\()(?!https?:|#)([^)#\s]+)")
-LISTED = re.compile(r"^\| (.*?\]\(.*?) \| (.*) \|$", re.MULTILINE)
-"""A row of docs/README.md: one or more pages, and what they answer."""
+LISTED = re.compile(r"^- (.*\]\([^)]*\))(?:: (.*))?$", re.MULTILINE)
+"""A line of docs/README.md: one or more pages, and what their titles do not say."""
 
 
 def prepare(folder: Path) -> None:
@@ -99,7 +99,7 @@ def relinked(source: str, text: str) -> str:
 
 
 def contents() -> dict[str, list[tuple[str, str]]]:
-    """Read docs/README.md: heading -> its pages, each a file and what it answers."""
+    """Read docs/README.md: heading -> its pages, each a file and what its title does not say."""
     parts = re.split("^## (.*)\n", (ROOT / "docs" / "README.md").read_text("utf-8"), flags=re.M)
     return {
         head: [
@@ -122,7 +122,10 @@ def write_plain(pages: Path, site: Path) -> None:
         "First": [("README.md", "what cloudrc is, and the first minute")],
         **contents(),
     }.items():
-        rows = (f"- [{title(source)}]({site_name(source)}): {about}\n" for source, about in listed)
+        rows = (
+            f"- [{title(source)}]({site_name(source)}){about and f': {about}'}\n"
+            for source, about in listed
+        )
         blocks.append(f"## {head}\n\n{''.join(rows)}")
     (site / "llms.txt").write_text("\n".join(blocks), encoding="utf-8")
 
