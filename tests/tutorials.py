@@ -18,6 +18,8 @@ from tests.support.pages import SHELL, blocks_of, files_of
 
 OTHER_NUMBERS = "other numbers"
 """Mark of a block of `text` whose numbers differ each time, because the commands took real time."""
+FAILS = re.compile(r"FAILURE: |^\d+ success, [1-9]\d* failure", re.MULTILINE)
+"""What a command says whose mission, or a flight of whose sweep, fails: it exits with 1."""
 READY = "to end: "
 """Begin of the line with which a session says that commands may come."""
 
@@ -50,7 +52,7 @@ class Reader:
                     self.start(line) if block.mark == "first terminal" else self.type(line)
 
     def type(self, line):
-        """Type a line; its command may only fail if a mission fails."""
+        """Type a line; its command may only fail if a mission or a flight of a sweep fails."""
         if line.startswith(("mkdir ", "pip install ")):
             return  # the test has a folder of its own, and all packages
         if line.startswith("cd "):
@@ -64,7 +66,7 @@ class Reader:
             text=True,
         )
         self.said += done.stdout + done.stderr
-        assert done.returncode == ("FAILURE: " in done.stdout), f"{line}\n{self.said}"
+        assert done.returncode == bool(FAILS.search(done.stdout)), f"{line}\n{self.said}"
 
     def start(self, line):
         """Type a line in the first terminal, and wait until it is ready."""
