@@ -272,7 +272,7 @@ bench: $(VENV)/all ## measure the closed loop against raw physics
 bench-cell: $(VENV)/all ## measure how punctual the cell of 50 robots is
 	$(bin)/python -m tools.bench_cell $(BENCH_CELL)
 
-results: $(VENV)/dev ## fly the results of docs/results.md and write them into it: two minutes
+results: $(VENV)/dev ## fly the results of docs/results.md and write them into it: minutes
 	$(bin)/python -m tools.results
 
 shown: $(VENV)/dev ## compare the numbers on pages with what their commands give: 15 minutes
