@@ -20,7 +20,18 @@ import cloudrc
 from cloudrc.metrics.control import ages_at_actuator
 from cloudrc.report.figures import own_settings
 from cloudrc.report.figures.style import BLACK, DOWNLINK, GREEN, GREY, UPLINK, VERMILION, Look
-from tools.pictures.stage import BLUE, GHOST, GOAL, RED, Array, Stage, View, check_size, smooth
+from tools.pictures.stage import (
+    BLUE,
+    GHOST,
+    GOAL,
+    RED,
+    Array,
+    Colour,
+    Stage,
+    View,
+    check_size,
+    smooth,
+)
 
 LINK = "satellite"
 TITLES = {
@@ -47,6 +58,12 @@ BETWEEN = 0.15
 """Time between two points of the path that is drawn [s]."""
 TOUCH = (*RED[:3], 0.35)
 """Colour of the ball at the place of the touch."""
+LEGEND: dict[str, Colour] = {
+    "flown path": BLUE,
+    "drone, as cloud believes": (*GHOST[:3], 1.0),
+    "target": GOAL,
+}
+"""What the colours of the view mean."""
 LONGEST_MS = 1_000.0
 """Upper end of the axis of delays and ages [ms]."""
 
@@ -72,12 +89,13 @@ def make_film(target: Path) -> None:
     halves = [Half(TITLES[name], each, *_curves(each, last)) for name, each in results.items()]
     stage = Stage("pelican", "pipes", (WIDTH, HEIGHT), {"robot": None, "ghost": GHOST})
     stage.open_pipes(CAMERA)
-    font = ImageFont.truetype(f"{mpl.get_data_path()}/fonts/ttf/DejaVuSans.ttf", 16)
     frames = []
     for now in [*np.arange(0.6, last, FASTER / RATE).tolist(), last]:
         frame = Image.new("RGB", (2 * WIDTH + GAP, HEAD + HEIGHT + STRIP), "white")
         for number, half in enumerate(halves):
-            frame.paste(_draw(stage, half, now, last, font), (number * (WIDTH + GAP), 0))
+            # A flight that has failed stands still from then on.
+            here = min(now, _failed_at(half.result))
+            frame.paste(_draw(stage, half, here, last), (number * (WIDTH + GAP), 0))
         frames.append(frame)
     times = [round(1e3 / RATE)] * (len(frames) - 1) + [HOLD_MS]
     frames[0].save(
@@ -92,7 +110,7 @@ def make_film(target: Path) -> None:
     check_size(target, BYTES_MAX)
 
 
-def _draw(stage: Stage, half: Half, now: float, last: float, font: Any) -> Any:
+def _draw(stage: Stage, half: Half, now: float, last: float) -> Any:
     """Return one half of the frame at a time of the flight [s]."""
     picture = Image.new("RGB", (WIDTH, HEAD + HEIGHT + STRIP), "white")
     picture.paste(Image.fromarray(_view(stage, half.result, now)), (0, HEAD))
@@ -100,7 +118,8 @@ def _draw(stage: Stage, half: Half, now: float, last: float, font: Any) -> Any:
     here = round(left + (right - left) * min(now, last) / last)
     picture.paste(half.empty, (0, HEAD + HEIGHT))
     picture.paste(half.drawn.crop((0, 0, here, STRIP)), (0, HEAD + HEIGHT))
-    pen = ImageDraw.Draw(picture)
+    pen, font = ImageDraw.Draw(picture), _font(16)
+    _explain(pen, now >= _failed_at(half.result))
     pen.text((2, 3), half.title, font=font, fill=BLACK)
     text, colour = _verdict(half.result, now)
     pen.text((2, 26), text, font=font, fill=colour)
@@ -108,9 +127,35 @@ def _draw(stage: Stage, half: Half, now: float, last: float, font: Any) -> Any:
     return picture
 
 
+def _explain(pen: Any, has_failed: bool) -> None:
+    """Write into the view what its colours mean, and that the drone has touched something."""
+    font = _font(12)
+    left, bottom = 8.0, HEAD + HEIGHT - 12
+    pen.rectangle((0, bottom - 10, WIDTH, HEAD + HEIGHT), fill="white")
+    for text, colour in LEGEND.items():
+        dot = (left, bottom - 4, left + 8, bottom + 4)
+        pen.ellipse(dot, fill=tuple(round(255 * part) for part in colour[:3]))
+        pen.text((left + 13, bottom), text, font=font, fill=BLACK, anchor="lm")
+        left += 13 + pen.textlength(text, font=font) + 16
+    if has_failed:
+        where = WIDTH / 2, HEAD + 22
+        text = "contact: the flight has failed"
+        pen.rectangle(pen.textbbox(where, text, font=_font(16), anchor="mm"), fill="white")
+        pen.text(where, text, font=_font(16), fill=VERMILION, anchor="mm")
+
+
+def _font(size: int) -> Any:
+    return ImageFont.truetype(f"{mpl.get_data_path()}/fonts/ttf/DejaVuSans.ttf", size)
+
+
+def _failed_at(result: cloudrc.Result) -> float:
+    """Return the time of the first failure [s]."""
+    return result.failures[0].time if result.failures else np.inf
+
+
 def _verdict(result: cloudrc.Result, now: float) -> tuple[str, str]:
     """Return what has become of the flight so far, and its colour."""
-    if result.failures and now >= result.failures[0].time:
+    if now >= _failed_at(result):
         first = result.failures[0]
         return f"FAILURE: {first.text} at {first.time:.1f} s", VERMILION
     if result.verdict == "success" and now >= result.flight.duration:
@@ -128,14 +173,12 @@ def _view(stage: Stage, result: cloudrc.Result, now: float) -> Array:
     stage.place("robot", truth["position"][row], truth["orientation_wxyz"][row])
     stage.place("ghost", applied["position"][command], applied["orientation_wxyz"][command])
     step = round(BETWEEN / float(np.median(np.diff(times))))
-    path, when = truth["position"][: row + 1 : step], times[: row + 1 : step]
-    touched = result.failures[0].time if result.failures else np.inf
-    colours = [RED if instant >= touched else BLUE for instant in when]
+    path = truth["position"][: row + 1 : step]
     balls = [(applied["setpoint"][command], 0.05, GOAL)]
-    if now >= touched:
+    if now >= _failed_at(result):
         balls.append((result.failures[0].place, 0.15, TOUCH))
     camera = replace(CAMERA, at=smooth(times, truth["position"], now, CALM))
-    return stage.draw(camera, path, colours, balls)
+    return stage.draw(camera, path, [BLUE] * len(path), balls)
 
 
 def _curves(result: cloudrc.Result, last: float) -> tuple[Any, Any, tuple[float, float]]:
@@ -155,13 +198,14 @@ def _curves(result: cloudrc.Result, last: float) -> tuple[Any, Any, tuple[float,
             figure.text(0.29, 0.87, "downlink delay", color=DOWNLINK)
             figure.text(0.51, 0.87, "age of what the robot acts on", color=BLACK)
             if is_drawn:
-                for name, colour in (("uplink", UPLINK), ("downlink", DOWNLINK)):
+                # Both delays are nearly equal: the downlink is a thin line upon a thick one.
+                for name, colour, size in (("uplink", UPLINK, 6.0), ("downlink", DOWNLINK, 1.0)):
                     arrivals = flight.during(f"/{name}_delay")
                     axes.plot(
                         flight.seconds(arrivals["stamp_ns"]),
                         1e3 * arrivals["delay"],
                         ".",
-                        ms=1.2,
+                        ms=size,
                         color=colour,
                     )
                 axes.plot(flight.seconds(ages.begin_ns), 1e3 * ages.low, color=BLACK, lw=0.8)

@@ -22,7 +22,7 @@ Colour: TypeAlias = tuple[float, float, float, float]
 GHOST, GOAL = (0.34, 0.71, 0.91, 0.35), (0.95, 0.45, 0.05, 1.0)
 """Colours of the robot that cloud predicts, and of the setpoint: as in the console."""
 BLUE, RED = (0.0, 0.45, 0.70, 1.0), (0.84, 0.20, 0.0, 1.0)
-"""Colours of the path, before and after a robot touches what it may not touch."""
+"""Colours of the path, and of what a robot touches and may not touch."""
 LINE = 0.015
 """Radius of the line of the path [m]."""
 LAMP = 8.0
