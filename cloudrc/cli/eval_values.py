@@ -15,13 +15,13 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.eval.setup import FILE, MEASURED, SEED, Compute
 from cloudrc.gym.options import ANSWER
 from cloudrc.link.library import read_profile
+from cloudrc.outside.address import check_url
 from cloudrc.outside.document import parse_value, read_document
 from cloudrc.outside.paths import check_new
 from cloudrc.outside.refusal import check_names
 from cloudrc.outside.tables import SECONDS
 from cloudrc.outside.values import ANY, Quantity
 from cloudrc.plugins import is_path, signature
-from cloudrc.policy.address import check_url
 from cloudrc.policy.observation import Mapped
 from cloudrc.trials.tables import CSV, PARQUET
 

@@ -10,8 +10,8 @@ import sys
 from cloudrc.cli.output import print_line, tell
 from cloudrc.cli.parser import Options, Parser, add_verbs, flags, whole_number
 from cloudrc.cli.processes import number_argument
+from cloudrc.drivers.openpi import KEY_VARIABLE
 from cloudrc.drivers.process import StopSignal
-from cloudrc.policy.address import KEY_VARIABLE
 
 VERBS = {
     "serve": "serve a Python policy over openpi's wire, until Ctrl-C",

@@ -34,7 +34,7 @@ from cloudrc.link.profile import NotNegative as NotNegative
 from cloudrc.link.profile import Positive as Positive
 from cloudrc.link.profile import refuse_start
 from cloudrc.messages import TOUCH_NAME_MAX
-from cloudrc.policy.address import check_url
+from cloudrc.outside.address import check_url
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Point = tuple[Finite, Finite, Finite]

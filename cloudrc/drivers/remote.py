@@ -19,12 +19,12 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+from cloudrc.drivers.openpi import KEY_VARIABLE
+from cloudrc.drivers.openpi.actions import ACTIONS, PolicyAnswerError, read_actions
+from cloudrc.drivers.openpi.client import PolicyClient, SilentServerError
+from cloudrc.drivers.openpi.codec import pack, unpack
 from cloudrc.drivers.teleop import UnixDatagrams
 from cloudrc.errors import CloudrcError, ControllerLostError
-from cloudrc.policy.actions import ACTIONS, PolicyAnswerError, read_actions
-from cloudrc.policy.address import KEY_VARIABLE
-from cloudrc.policy.client import PolicyClient, SilentServerError
-from cloudrc.policy.codec import pack, unpack
 
 WIDTH = 4
 """Numbers of a row: vx, vy, vz [m/s], yaw rate [rad/s]."""

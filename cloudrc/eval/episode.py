@@ -23,6 +23,7 @@ from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from cloudrc import source
+from cloudrc.drivers.openpi.actions import PolicyAnswerError, read_actions
 from cloudrc.errors import CloudrcError
 from cloudrc.eval.environment import environment_code, find_module
 from cloudrc.eval.setup import BARE, SEED, Episode, EvalSetup, link_at
@@ -33,7 +34,6 @@ from cloudrc.gym.values import leaves, size_of
 from cloudrc.outside.code import calling
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import ANY, RESULT, InvalidValueError, to_arrays, to_boolean
-from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
 from cloudrc.policy.observation import observe
 from cloudrc.rounding import exceeds
@@ -153,8 +153,8 @@ def asking(setup: EvalSetup) -> Iterator[Ask]:
         policy.reset()
         yield policy.infer
         return
-    from cloudrc.policy.address import KEY_VARIABLE
-    from cloudrc.policy.client import PolicyClient
+    from cloudrc.drivers.openpi import KEY_VARIABLE
+    from cloudrc.drivers.openpi.client import PolicyClient
 
     with PolicyClient(setup.policy, key=os.environ.get(KEY_VARIABLE, "")) as client:
         yield client.infer

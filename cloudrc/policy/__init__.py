@@ -1,8 +1,3 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The wire of openpi's policies: observations up, chunks of actions down, over a WebSocket.
-
-The server speaks first: one map, its metadata. Then the client sends an observation and the server
-answers with actions, in turns. Each message is a binary frame with one msgpack map. An error is a
-text frame, after which the server closes the connection.
-"""
+"""Policies of users: load them, serve them over the wire of `drivers.openpi`."""

@@ -18,10 +18,10 @@ from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
+from cloudrc.drivers.openpi.actions import PolicyAnswerError, read_actions
+from cloudrc.drivers.openpi.codec import MESSAGE_MAX, WireError, pack, unpack
 from cloudrc.errors import describe_error
 from cloudrc.files import at_place
-from cloudrc.policy.actions import PolicyAnswerError, read_actions
-from cloudrc.policy.codec import MESSAGE_MAX, WireError, pack, unpack
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
 
 HEALTH = "/healthz"

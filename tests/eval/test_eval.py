@@ -16,12 +16,12 @@ from cloudrc.cli.eval_values import (
     read_compute,
     read_mapped,
 )
+from cloudrc.drivers.openpi.actions import PolicyAnswerError
+from cloudrc.drivers.openpi.codec import pack
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval.episode import as_actions, play, width_of
 from cloudrc.eval.setup import Episode, EvalSetup, link_at
 from cloudrc.outside.values import InvalidValueError
-from cloudrc.policy.actions import PolicyAnswerError
-from cloudrc.policy.codec import pack
 from cloudrc.policy.observation import Mapped, observe
 from tests.eval.conftest import LAW
 from tests.policy.conftest import after, serving, stock_like

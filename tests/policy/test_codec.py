@@ -6,7 +6,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from cloudrc.policy.codec import WireError, pack, unpack
+from cloudrc.drivers.openpi.codec import WireError, pack, unpack
 from tests.tensors import KINDS, Tensor
 
 

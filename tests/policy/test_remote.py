@@ -12,10 +12,10 @@ from cloudrc import assembly
 from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers import remote
+from cloudrc.drivers.openpi.codec import unpack
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError, ControllerLostError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
-from cloudrc.policy.codec import unpack
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.records import UNSENT
 from cloudrc.runs.experiment import check_mode

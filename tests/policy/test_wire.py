@@ -15,8 +15,8 @@ import pytest
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect
 
+from cloudrc.drivers.openpi.client import PolicyClient, PolicyServerError, SilentServerError
 from cloudrc.errors import CloudrcError
-from cloudrc.policy.client import PolicyClient, PolicyServerError, SilentServerError
 from tests.policy.conftest import actions, serving, stock_like
 
 STATE = {"state": np.arange(3.0)}

@@ -14,9 +14,9 @@ from collections.abc import Callable
 from typing import Any
 
 from cloudrc.bridges.ros2.node import WAKE, RosAnswer, RosNode
+from cloudrc.drivers.openpi.codec import pack, unpack
 from cloudrc.drivers.teleop import UnixDatagrams
 from cloudrc.errors import ControllerLostError
-from cloudrc.policy.codec import pack, unpack
 
 LOOK_PERIOD = 0.5
 """Time between two looks at the nodes [s], and the silence after which cloud is told about it."""

@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The address and the API key of a policy's server."""
+"""The address of a policy's server."""
 
 from __future__ import annotations
 
 from urllib.parse import urlsplit
-
-KEY_VARIABLE = "CLOUDRC_POLICY_KEY"
-"""Environment variable with the API key of a policy's server, for the server and for clients."""
 
 
 def check_url(url: str) -> str:

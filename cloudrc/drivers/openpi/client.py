@@ -11,9 +11,9 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
+from cloudrc.drivers.openpi import KEY_VARIABLE
+from cloudrc.drivers.openpi.codec import MESSAGE_MAX, WireError, pack, unpack
 from cloudrc.errors import CloudrcError, describe_error, to_one_line
-from cloudrc.policy.address import KEY_VARIABLE
-from cloudrc.policy.codec import MESSAGE_MAX, WireError, pack, unpack
 
 START_LIMIT = 60.0
 """Time limit for the metadata and for the first answer of a server [s]: it loads weights."""
