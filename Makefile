@@ -208,7 +208,7 @@ $(EVIDENCE)/delayed-cartpole.md:
 	build/sb3/bin/python examples/delayed_cartpole.py > $@
 
 # Beside, not in the environment: a clone keeps its viser.
-CONSOLE_TESTS = tests/console tests/report/test_replay.py -m 'not full'
+CONSOLE_TESTS = tests/console tests/report/test_replay.py tests/report/test_scene.py -m 'not full'
 viser: $(VENV)/dev ## test console and replay on the locked viser, and on the newest one
 	for viser in "$$(grep -o '^viser==[0-9.]*' tests/requirements.txt)" viser; do \
 		rm -rf build/viser && $(bin)/python -m pip install --quiet --no-deps --target build/viser "$$viser" \

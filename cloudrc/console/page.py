@@ -33,11 +33,11 @@ from cloudrc.console.feed import (
     UPLINK,
     FlightFeed,
 )
-from cloudrc.console.scene import LEGEND, FlightScene
 from cloudrc.console.steering import Steering, is_drive
 from cloudrc.geometry.clearance import Array
 from cloudrc.messages import ZERO, Quaternion, Vector
 from cloudrc.metrics.definitions import CHARTED
+from cloudrc.report.scene import LEGEND, FlightScene
 from cloudrc.robots.shapes import read_shapes
 from cloudrc.teleop.client import describe_mission
 from cloudrc.teleop.telling import describe_robot

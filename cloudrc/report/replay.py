@@ -17,11 +17,11 @@ import rich
 import viser
 
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.console.scene import FlightScene
 from cloudrc.errors import NothingFlownError
 from cloudrc.metrics.flight import Flight
 from cloudrc.metrics.mission import reported
 from cloudrc.report.flown import flown_shapes
+from cloudrc.report.scene import FlightScene
 
 RATE = 25.0
 """Number of frames per second of flight time."""

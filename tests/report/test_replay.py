@@ -78,7 +78,7 @@ def test_without_replay_a_line_says_why(lack, words, tmp_path, monkeypatch):
     experiment, recording = paper()
     if lack == "viser":
         monkeypatch.setitem(sys.modules, "viser", None)
-        for name in ("cloudrc.report.replay", "cloudrc.console.scene"):
+        for name in ("cloudrc.report.replay", "cloudrc.report.scene"):
             monkeypatch.delitem(sys.modules, name)
     else:
         recording = Log().flight(OPEN_AIR).recording

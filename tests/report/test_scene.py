@@ -9,8 +9,8 @@ import viser
 
 from cloudrc.config.load import load_experiment
 from cloudrc.config.scene import scene_of
-from cloudrc.console.scene import FlightScene, clearance_colours
 from cloudrc.geometry.clearance import CLEARANCE_SHOWN
+from cloudrc.report.scene import FlightScene, clearance_colours
 from cloudrc.robots.shapes import read_shapes
 
 
