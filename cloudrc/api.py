@@ -396,22 +396,22 @@ def verify(
         cloudrc.errors.MissingPrerequisiteError: If root rights or a kubeconfig are missing.
         cloudrc.errors.TimedOutError: If the link or the pods do not answer in time.
     """
-    from cloudrc.runs.links import verify as work
-
     check_names("mode", [mode], ("local", "cluster"))
     if seconds is not None:
         with naming("seconds"):
             SECONDS.of(seconds)
     if mode == "local":
-        texts = _texts(settings or {})
-        return work.verify(target, texts, shaper=shaper, seconds=seconds)
-    limit = seconds or work.RELEASE_TIMEOUT
+        from cloudrc.runs.links.verify import verify as measure
+
+        return measure(target, _texts(settings or {}), shaper=shaper, seconds=seconds)
     require("mode cluster", ("kube",))
+    from cloudrc.cluster import verify as of_release
     from cloudrc.cluster.releases import choose_release
 
     place = choose_release(context, namespace, release)
-    with work.forwarded_pods(place) as pods:
-        return work.verify_release(place.name, pods, limit)
+    with of_release.forwarded_pods(place) as pods:
+        limit = seconds or of_release.RELEASE_TIMEOUT
+        return of_release.verify_release(place.name, pods, limit)
 
 
 def _warn(*experiments: ResolvedExperiment) -> None:

@@ -69,27 +69,27 @@ def execute(options: Options) -> int:
 
 
 def _verify(options: Options) -> Report:
-    from cloudrc.runs.links.verify import (
-        RELEASE_TIMEOUT,
-        forwarded_pods,
-        pods_at,
-        verify,
-        verify_release,
-    )
+    if options.ends or options.mode == "cluster":
+        return _verify_release(options)
+    from cloudrc.runs.links.verify import verify
 
-    limit = options.seconds or RELEASE_TIMEOUT
-    if options.ends:
-        hosts = options.ends.split(",")
-        if len(hosts) != 2 or not all(hosts):
-            raise BadInputError(f"--ends {options.ends}: give two hosts, WORLD,CLOUD")
-        return verify_release(options.release or "cloudrc", pods_at(hosts), limit)
-    if options.mode == "cluster":
-        release = flown_release(options)
-        with forwarded_pods(release) as pods:
-            return verify_release(release.name, pods, limit)
     return verify(
         options.target,
         options.settings,
         shaper=options.shaper,
         seconds=options.seconds,
     )
+
+
+def _verify_release(options: Options) -> Report:
+    from cloudrc.cluster.verify import RELEASE_TIMEOUT, forwarded_pods, pods_at, verify_release
+
+    limit = options.seconds or RELEASE_TIMEOUT
+    if not options.ends:
+        release = flown_release(options)
+        with forwarded_pods(release) as pods:
+            return verify_release(release.name, pods, limit)
+    hosts = options.ends.split(",")
+    if len(hosts) != 2 or not all(hosts):
+        raise BadInputError(f"--ends {options.ends}: give two hosts, WORLD,CLOUD")
+    return verify_release(options.release or "cloudrc", pods_at(hosts), limit)

@@ -245,7 +245,7 @@ def _fly(options: Options, api: Api) -> int:
 
 def _keep_report(options: Options, order: Json, view: Json) -> None:
     """Keep a report of a mission; without one, say why: the verdict counts."""
-    from cloudrc.runs.kept import Retention, keep_report
+    from cloudrc.cluster.kept import Retention, keep_report
 
     if not (options.config and options.profile):
         raise BadInputError("--report needs --config and --profile")
@@ -262,8 +262,8 @@ def _report(options: Options, _: Api | None = None) -> int:
     """Write the report of a mission of a release; return the exit code of its verdict."""
     from cloudrc.cli import report
     from cloudrc.cli.where import flown_release
+    from cloudrc.cluster.kept import fetch_mission
     from cloudrc.runs.folder import new_folder
-    from cloudrc.runs.kept import fetch_mission
 
     options.release = options.where or options.release
     release = flown_release(options)

@@ -112,8 +112,7 @@ def propose(config: Path) -> tuple[str, str]:
 @contextmanager
 def _beside(say: Say, *words: str) -> Iterator[None]:
     """Run a module during the `with` block; pass its address or its error to `say`."""
-    from cloudrc.cluster.client import end_process
-    from cloudrc.drivers.machine import interpreter
+    from cloudrc.drivers.machine import end_process, interpreter
 
     process: subprocess.Popen[Any] = subprocess.Popen(
         interpreter("-m", *words),

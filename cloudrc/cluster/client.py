@@ -19,7 +19,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
-from cloudrc.drivers.machine import await_or_kill
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError, to_one_line
 
 DEFAULT_RELEASE = "cloudrc"
@@ -41,8 +40,6 @@ PATIENCE, PAUSE = 60.0, 2.0
 attempts [s]."""
 PROGRAM_LIMIT = 120.0
 """Time limit for one command of kubectl or helm [s], such as the copy of a recording."""
-STOP_LIMIT = 2.0
-"""Time from SIGTERM to SIGKILL, in which a program can end by itself [s]."""
 PACKAGE = Path(__file__).resolve().parents[1]
 _KINDS = {
     **{
@@ -336,12 +333,6 @@ def last_words(stderr: bytes) -> str:
     if "error dialing backend" in message:  # the API server reaches no kubelet
         message += "; the pod's node does not answer, see: kubectl get nodes"
     return message or "no error message"
-
-
-def end_process(process: subprocess.Popen[Any]) -> None:
-    """End a program by SIGTERM, and by SIGKILL after `STOP_LIMIT`."""
-    process.terminate()
-    await_or_kill(process, STOP_LIMIT)
 
 
 def chart_folder(package: Path = PACKAGE) -> Path:

@@ -15,7 +15,6 @@ import subprocess
 import tempfile
 import threading
 import time
-import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from http.client import HTTPConnection
@@ -24,18 +23,17 @@ from typing import IO, Any
 
 from cloudrc.cluster.client import (
     REQUEST_TIMEOUT,
-    STOP_LIMIT,
     ClusterError,
     ExpiredError,
     NoAnswerError,
     Release,
-    end_process,
     explain_errors,
     last_words,
     program,
     run,
 )
 from cloudrc.cluster.releases import CLOUDRC, COMPONENT, INSTANCE, no_release
+from cloudrc.drivers.machine import STOP_LIMIT, end_process
 from cloudrc.errors import StateError, TimedOutError, to_one_line
 from cloudrc.record import part_before
 
@@ -70,8 +68,6 @@ CELL = "cell"
 """Component of a fleet's cell, and name of its container."""
 DATA = "/var/lib/cloudrc"
 """Folder of the recordings in the pods of world, cloud and cell."""
-NO_PROXY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-"""Opens URLs of this machine directly, even if environment variables name a proxy."""
 START_LIMIT = 20.0
 """Time limit for kubectl to start to forward ports [s]."""
 LOOK_PERIOD = 0.05

@@ -18,6 +18,8 @@ from typing import Any
 LINUX_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 CGROUP, CGROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 """File with the control groups of this process, and folder of all groups."""
+STOP_LIMIT = 2.0
+"""Time from SIGTERM to SIGKILL, in which a program can end by itself [s]."""
 MACOS_BOOT_ID = ("sysctl", "-n", "kern.bootsessionuuid")
 
 
@@ -111,3 +113,9 @@ def await_or_kill(process: subprocess.Popen[Any], limit: float) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
+
+
+def end_process(process: subprocess.Popen[Any]) -> None:
+    """End a program by SIGTERM, and by SIGKILL after `STOP_LIMIT`."""
+    process.terminate()
+    await_or_kill(process, STOP_LIMIT)

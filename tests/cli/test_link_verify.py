@@ -10,10 +10,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from cloudrc.cluster import verify
+from cloudrc.cluster.verify import verify_release
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.records import LinkChecked
-from cloudrc.runs.links import verify
-from cloudrc.runs.links.verify import OF_PROGRAMS, as_text, verify_release
+from cloudrc.runs.links.verify import OF_PROGRAMS, as_text
 
 PAGE = {"shaper": "relay", "reason": "", "interface": "eth0", "netems": {}}
 MEASURED = {"ok": 0.0451, "open": 0.0451, "off": 0.0902}

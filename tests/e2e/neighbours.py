@@ -7,8 +7,9 @@ from contextlib import contextmanager
 from urllib.parse import urlencode
 
 from cloudrc.cluster.client import connect
-from cloudrc.cluster.pods import NO_PROXY, forwarded
+from cloudrc.cluster.pods import forwarded
 from tests.e2e.conftest import MONITORING, NAMESPACE, apply, command, kubectl, pod
+from tests.support.http import DIRECT
 
 TRY_PORTS = """\
 import json, socket, sys
@@ -130,7 +131,7 @@ def queries():
 
         def ask(query):
             url = f"http://127.0.0.1:{ports[9090]}/api/v1/query?{urlencode({'query': query})}"
-            with NO_PROXY.open(url, timeout=10) as answer:
+            with DIRECT.open(url, timeout=10) as answer:
                 said = json.load(answer)
             assert said["status"] == "success", said
             return list(said["data"]["result"])

@@ -18,9 +18,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from cloudrc.cluster.client import end_process
 from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.drivers.local import ROUTE_FILE, link_words, start_process
+from cloudrc.drivers.machine import end_process
 from cloudrc.drivers.programs import run_tool
 from cloudrc.drivers.realtime import bind, free_ports, show_address, split_address
 from cloudrc.errors import (

@@ -1,25 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Compare a link with its profile, by probes or in flight.
+"""Compare a link with its profile: start it on this machine, and measure it with probes.
 
-By probes: start a link on this machine and measure it. In a cluster no probes are sent: world and
-cloud each compare the datagrams that they receive with the profile. They serve their verdicts at
-/link.json on their metrics ports. The link containers serve the state of their shapers at the same
-path.
+Another module, `cluster.verify`, asks a release in flight.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import time
+import urllib.request
 from collections.abc import Iterator, Mapping, Sequence
 from math import inf, nan
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from cloudrc.cluster.client import Release
-from cloudrc.cluster.pods import METRICS, NO_PROXY, find_pod, forwarded
 from cloudrc.config import shipped
 from cloudrc.config.load import read_experiment
 from cloudrc.config.profile import Profile
@@ -27,7 +22,6 @@ from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import known_robot
 from cloudrc.config.schema import Experiment
 from cloudrc.drivers.programs import run_tool
-from cloudrc.errors import TimedOutError
 from cloudrc.link.netem import check, find_netems
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import link_profile
@@ -46,12 +40,11 @@ from cloudrc.runs.links.under_test import LOOPBACK, WAYS, Way, inside, measure, 
 from cloudrc.text import Paint, escape, plain, table
 from cloudrc.tunnel.codec import SIZES, TELEMETRY_SIZES, Kind
 
-RELEASE_TIMEOUT = 270.0  # default time limit for the verdict on a release [s]
 COUNTS_WAIT = 1.3  # after the last probe: processes update their counts once a second [s]
-POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0  # between requests to a release; limit of a request [s]
-PORTS = METRICS["world"]["world"], METRICS["world"]["link"]
+HTTP_TIMEOUT = 3.0  # limit of a request [s]
+NO_PROXY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+"""Opens URLs directly, even if environment variables name a proxy."""
 NOT_JUDGED = "NOT JUDGED"  # in a note about a quantity that could not be verified
-KEYS = ("asked", "measured", "low", "high")
 OF_PROGRAMS = "send more, or run longer"
 """How the link of a user's programs gets more packets."""
 COLUMNS = ("asked", "applied", "measured")
@@ -65,8 +58,6 @@ MEANINGS = {
 }
 """Verdict on a link -> its colour, and what it means."""
 Report: TypeAlias = dict[str, Any]
-Pods: TypeAlias = Mapping[str, Sequence[str]]
-"""World or cloud -> two URLs: the metrics port of the process, and that of its link container."""
 
 
 def find_experiment(target: str, settings: Sequence[str]) -> ResolvedExperiment:
@@ -145,52 +136,6 @@ def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Measurement]) -> dic
     return found
 
 
-def pods_at(hosts: Sequence[str]) -> Pods:
-    """Return the URLs of the metrics of both pods, at the hosts of world and cloud."""
-    world, cloud = ([f"http://{host}:{port}" for port in PORTS] for host in hosts)
-    return {"world": world, "cloud": cloud}
-
-
-@contextlib.contextmanager
-def forwarded_pods(release: Release) -> Iterator[Pods]:
-    """Forward the metrics of both pods of a release while the `with` block runs."""
-    pods = {}
-    with contextlib.ExitStack() as stack:
-        for end in ("world", "cloud"):
-            pod = find_pod(release, end).metadata.name
-            local = stack.enter_context(forwarded(release, pod, PORTS))
-            pods[end] = [f"http://{LOOPBACK}:{local[port]}" for port in PORTS]
-        yield pods
-
-
-def verify_release(title: str, pods: Pods, limit: float = RELEASE_TIMEOUT) -> Report:
-    """Fetch the verdicts on both directions of a release's link, and report them.
-
-    World judges the downlink, cloud the uplink. Wait at most `limit` [s] for both verdicts.
-
-    Raises:
-        TimedOutError: If world or cloud does not answer in time.
-    """
-    seen = _await_verdicts(pods, limit)
-    if silent := [receiver for way, (_, receiver, _) in WAYS.items() if way not in seen]:
-        text = f"{' and '.join(silent)} did not answer within {limit:g} s: are the pods ready?"
-        raise TimedOutError(text)
-    return make_report(title, {way: _findings(seen[way], pods[WAYS[way][0]][1]) for way in WAYS})
-
-
-def _await_verdicts(pods: Pods, limit: float) -> dict[str, Any]:
-    """Return the newest answer about each direction, once both are decided or after `limit` [s]."""
-    deadline, seen = time.monotonic() + limit, dict[str, Any]()
-    while True:
-        time.sleep(POLL_PERIOD)
-        for way, (_, receiver, _) in WAYS.items():
-            if page := fetch(f"{pods[receiver][0]}/link.json"):
-                seen[way] = json.loads(page)
-        decided = [one["verdict"] in ("ok", "off") for one in seen.values()] == [True, True]
-        if decided or time.monotonic() >= deadline:
-            return seen
-
-
 def fetch(url: str) -> str:
     """Fetch a page, without a proxy; return "" if the server does not answer."""
     try:
@@ -198,17 +143,6 @@ def fetch(url: str) -> str:
             return str(page.read().decode())
     except OSError:
         return ""
-
-
-def _findings(found: Mapping[str, Any], link: str) -> Findings:
-    """Combine the receiver's verdict `found` with the link container's report at the URL `link`."""
-    page, rows = json.loads(fetch(f"{link}/link.json") or "{}"), []
-    for one in found["rows"]:
-        asked, measured, low, high = (float(one.get(key, nan)) for key in KEYS)
-        rows.append(Judgement(one["quantity"], asked, measured, low, high, one["verdict"]))
-    count = max((one["datagrams"] for one in found["rows"]), default=0)
-    known = read_evidence(page, read_metrics(fetch(f"{link}/metrics")))
-    return Findings(rows, known, f"{count} of the tunnel's own datagrams")
 
 
 def _notes(way: str, rows: Sequence[Judgement]) -> Iterator[str]:

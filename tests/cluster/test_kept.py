@@ -9,12 +9,12 @@ from unittest.mock import Mock
 
 import pytest
 
+from cloudrc.cluster import kept
 from cloudrc.cluster.client import Release
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.report.folder import read_run
-from cloudrc.runs import kept
 from cloudrc.teleop.store import MissionRecord
 from tests.cluster.test_flight import flown, record
 from tests.record.conftest import later
