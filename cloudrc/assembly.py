@@ -18,7 +18,6 @@ import numpy as np
 
 from cloudrc.cloud.controllers import Controller
 from cloudrc.cloud.controllers.remote import ControllerChannel, OutsideController
-from cloudrc.cloud.controllers.ros2 import RosController
 from cloudrc.cloud.endpoint import CloudEndpoint, ComputeTime
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.news import SendOnDelta
@@ -32,6 +31,7 @@ from cloudrc.config.robot import RobotFacts, facts, is_planar
 from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.config.time_line import find_ways
+from cloudrc.drivers.channels import find_channel
 from cloudrc.errors import ControllerLostError
 from cloudrc.geometry.fence import Fence
 from cloudrc.link.cell import FRAME_NS, Bulk, Cell, Video
@@ -170,13 +170,8 @@ def _lock_step(
     controller = build_controller(experiment)
     if not isinstance(controller, OutsideController):
         return nullcontext()
-    if isinstance(controller, RosController):
-        from cloudrc.bridges.ros2.lock_step import RosLockStep
-
-        return closing(RosLockStep(controller.place, controller.start_limit, gone))
-    from cloudrc.drivers.remote import LockStep
-
-    return closing(LockStep(controller.place, controller.start_limit))
+    connect = find_channel(controller.channel).get("lock_step")
+    return closing(connect(controller.place, controller.start_limit, gone))
 
 
 def lost_controller(records: Iterable[Record]) -> Iterator[ControllerLostError]:

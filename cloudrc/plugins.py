@@ -39,6 +39,7 @@ PACKAGES = {
     "controllers": "cloudrc.cloud.controllers",
     "onboard": "cloudrc.robots.onboard",
     "executors": "cloudrc.gym.executors",
+    "channels": "cloudrc.drivers.channels",
     "motion": "",
     "metrics": "",
     "policies": "",
@@ -105,9 +106,13 @@ def names(kind: str) -> list[str]:
 
 
 def installed(kind: str) -> dict[str, EntryPoint]:
-    """Return name -> entry point of each installed plug-in of a kind; shipped names win."""
-    shipped = _shipped(kind)
-    return {name: entry for name, entry in _installed(kind).items() if name not in shipped}
+    """Return name -> entry point of each plug-in of a kind of other packages; shipped names win."""
+    shipped, entries = _shipped(kind), _installed(kind).items()
+    return {
+        name: entry
+        for name, entry in entries
+        if name not in shipped and not entry.module.startswith("cloudrc.")
+    }
 
 
 def describe(kind: str, name: str) -> str:

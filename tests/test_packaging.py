@@ -11,6 +11,7 @@ import tomllib
 import venv
 import zipfile
 from hashlib import sha256
+from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,13 @@ SHIPPED = {".py", ".c", ".yaml", ".xml", ".typed", ".csv", ".html", ".css", ".js
 def test_cloudrc_is_a_plugin_of_kubectl_and_names_one_version():
     assert PROJECT["scripts"]["kubectl-cloudrc"] == PROJECT["scripts"]["cloudrc"]
     assert f"\nversion: {cloudrc.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+@pytest.mark.parametrize("group", PROJECT["entry-points"])
+def test_the_entry_points_of_guests_name_what_there_is(group):
+    ours = {entry.name: entry for entry in distribution("cloudrc").entry_points.select(group=group)}
+    assert {name: entry.value for name, entry in ours.items()} == PROJECT["entry-points"][group]
+    assert all(entry.load() for entry in ours.values())
 
 
 def build(root, folder, *targets):

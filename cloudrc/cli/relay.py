@@ -95,7 +95,7 @@ def execute(options: Options) -> None:
         report = relay_tcp(settings_from(options, RelaySettings), tell)
         text = _as_text(report)
     else:
-        from cloudrc.runs.links.topics import TopicSettings, relay_topic
+        from cloudrc.bridges.ros2.topics import TopicSettings, relay_topic
         from cloudrc.runs.links.verify import OF_PROGRAMS, as_text
 
         report = relay_topic(settings_from(options, TopicSettings), tell)

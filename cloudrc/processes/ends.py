@@ -10,15 +10,15 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cloudrc import assembly, source
 from cloudrc.cloud.controllers.remote import OutsideController
-from cloudrc.cloud.controllers.ros2 import RosController
 from cloudrc.config.compute import check_unshared
 from cloudrc.config.load import load_experiment, read_experiment, robot_settings
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import known_robot
+from cloudrc.drivers.channels import find_channel
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.link_monitor import LinkMonitor
 from cloudrc.drivers.machine import clock_id
@@ -42,8 +42,8 @@ from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES, Kind
 from cloudrc.tunnel.end import Identity
 
 if TYPE_CHECKING:
+    from cloudrc.drivers.channels.remote import RemoteLink
     from cloudrc.drivers.recording import Recorder
-    from cloudrc.drivers.remote import RemoteLink
 
 TRACE_MAX = 2 << 20
 """Maximum size of a trace file whose name comes from the link process [bytes]. World and cloud do
@@ -124,7 +124,7 @@ def _remote_link(experiment: ResolvedExperiment, folder: Path) -> Iterator[Remot
         yield None
         return
     require("a remote controller", ("policy",))
-    from cloudrc.drivers.remote import DATAGRAM_MAX, RemoteLink, sockets_of
+    from cloudrc.drivers.channels.remote import DATAGRAM_MAX, RemoteLink, sockets_of
 
     with closing(UnixDatagrams(*sockets_of(folder), DATAGRAM_MAX)) as peer:
         period = 1.0 / experiment.cloud.command_rate_hz
@@ -139,22 +139,19 @@ def run_remote(
     `folder` has the sockets between cloud and the driver. A supervisor reads the feed if it is
     `watched`. `robot` is the number in a fleet.
     """
-    from cloudrc.drivers.remote import DATAGRAM_MAX, RemoteDriver, sockets_of
+    from cloudrc.drivers.channels.remote import DATAGRAM_MAX, sockets_of
 
     feed = Feed.on_stdout(watched=watched)
     controller = assembly.build_controller(load_experiment(str(config), robot_settings(robot)))
     assert isinstance(controller, OutsideController), "the supervisor starts it for no other"
     other, own = sockets_of(folder)
     with closing(UnixDatagrams(own, other, DATAGRAM_MAX)) as peer:
-        if isinstance(controller, RosController):
-            from cloudrc.bridges.ros2.driver import RosDriver
 
-            def tell(text: str) -> None:
-                feed.tell([Fault(time.monotonic_ns(), "controller_unstamped", text)])
+        def tell(text: str) -> None:
+            feed.tell([Fault(time.monotonic_ns(), "controller_unstamped", text)])
 
-            driver: Any = RosDriver(peer, controller.place, tell)
-        else:
-            driver = RemoteDriver(peer, controller.place, controller.start_limit)
+        connect = find_channel(controller.channel).get("driver")
+        driver = connect(peer, controller.place, controller.start_limit, tell)
         driver.run(feed.alive_while(stop))
 
 

@@ -9,11 +9,12 @@ from collections.abc import Iterable
 from cloudrc.config import overrides
 from cloudrc.config.compute import check_unshared
 from cloudrc.config.load import load_experiment
-from cloudrc.config.overrides import OUTSIDE, ROS2, Settings, naming_settings, parse_settings
+from cloudrc.config.overrides import OUTSIDE, Settings, naming_settings, parse_settings
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import has_mujoco
 from cloudrc.config.schema import Parameters, World
+from cloudrc.drivers.channels import find_channel
 from cloudrc.drivers.machine import usable_cores
 from cloudrc.metrics import measure
 from cloudrc.outside.reuse import reuse
@@ -110,11 +111,7 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
             text = f"{controller} flies on this machine only; use --mode virtual or local"
             raise problem_at("cloud.controller", text)
         require("a remote controller", ("policy",))
-        if controller == ROS2:
-            from cloudrc.bridges.ros2 import require_ros
-
-            packages = "nav_msgs, geometry_msgs and sensor_msgs"
-            require_ros("cloud.controller ros2", "node", packages)
+        find_channel(controller).get("check")()
 
 
 def check_world(world: World, *, turns: bool = False) -> None:

@@ -3,11 +3,13 @@
 """What ROS 2 needs, and its messages, without a ROS."""
 
 import sys
+from importlib.metadata import EntryPoints
 from math import pi
 
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from cloudrc import plugins
 from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
@@ -31,6 +33,19 @@ def test_without_ros_a_flight_is_refused_before_a_folder_is_made(tmp_path, monke
     (error,) = capsys.readouterr().err.splitlines()
     assert "source /opt/ros" in error
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("lack", ["entry point", "module"])
+def test_without_the_bridge_a_line_names_its_extra(lack, tmp_path, monkeypatch, capsys):
+    if lack == "module":
+        monkeypatch.setitem(sys.modules, "cloudrc.bridges.ros2.channel", None)
+    else:
+        monkeypatch.syspath_prepend(tmp_path)  # another search path is searched anew
+        monkeypatch.setattr(plugins, "entry_points", EntryPoints)
+    assert main(["run", "paper", "--mode", "virtual", "--set", "cloud.controller=ros2"]) == 3
+    (error,) = capsys.readouterr().err.splitlines()
+    assert "channel" in error
+    assert "pip install 'cloudrc[policy]'" in error
 
 
 def test_a_node_neither_plans_nor_flies_in_a_cluster():

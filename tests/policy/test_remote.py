@@ -11,7 +11,7 @@ import pytest
 from cloudrc import assembly
 from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.config.load import load_experiment
-from cloudrc.drivers import remote
+from cloudrc.drivers.channels import remote
 from cloudrc.drivers.openpi.codec import unpack
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError, ControllerLostError

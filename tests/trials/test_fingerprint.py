@@ -8,6 +8,7 @@ import pytest
 
 from cloudrc import plugins
 from cloudrc.errors import BadInputError
+from cloudrc.trials.fingerprint import installed_plugins
 from cloudrc.trials.plan import pack, read_plan, unpack
 
 PLUG = """from cloudrc.cloud.predictors.last_sample import LastSample
@@ -46,6 +47,11 @@ def key(write_sweep):
     path = write_sweep({"cloud.predictor": ["mine"]})
     (found,) = read_plan(path).flights
     return found
+
+
+def test_what_cloudrc_brings_itself_is_no_plug_in_of_another_package():
+    assert "ros2" in plugins.names("channels")
+    assert installed_plugins() == {}
 
 
 PACKAGE = {"mypkg/__init__.py": "", "mypkg/plug.py": PLUG}

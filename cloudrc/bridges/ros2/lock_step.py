@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from cloudrc.bridges.ros2.node import WAKE, RosNode
-from cloudrc.drivers.remote import SILENT, VIRTUAL_LIMIT
+from cloudrc.drivers.channels.remote import SILENT, VIRTUAL_LIMIT
 from cloudrc.errors import ControllerLostError
 
 SETTLE = 0.2

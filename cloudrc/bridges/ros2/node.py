@@ -27,7 +27,7 @@ from cloudrc.bridges.ros2.own_node import (
     known,
     name_of,
 )
-from cloudrc.drivers.remote import INVALID
+from cloudrc.drivers.channels.remote import INVALID
 from cloudrc.errors import ControllerLostError
 from cloudrc.record.live import (
     WORLD,

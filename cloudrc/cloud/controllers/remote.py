@@ -47,10 +47,13 @@ class OutsideController(Controller):
     """Asks a program for each command; stands still while it has no valid answer.
 
     Attributes:
+        channel: Name or path of the channel to the program: see `drivers.channels`.
         place: Where the program is: an address, or a namespace of ROS.
         start_limit: Time limit for the first answer of an episode [s].
         surroundings: What there is to know besides estimate and setpoint.
     """
+
+    channel = "remote"
 
     def __init__(self, place: str, start_limit: float) -> None:
         self.place, self.start_limit = place, start_limit

@@ -52,6 +52,22 @@ SILENT, INVALID = "controller_silent", "controller_invalid"
 """Codes of a lost controller; those of `records.CONTROLLER_LOST`."""
 
 
+def check() -> None:
+    """Raise nothing: the extra `policy` is all that this channel needs."""
+
+
+def lock_step(url: str, start_limit: float, gone: Callable[[], bool]) -> LockStep:
+    """Connect to the program at `url` in virtual time."""
+    return LockStep(url, start_limit)
+
+
+def driver(
+    peer: UnixDatagrams, url: str, start_limit: float, tell: Callable[[str], None]
+) -> RemoteDriver:
+    """Connect to the program at `url` in real time."""
+    return RemoteDriver(peer, url, start_limit)
+
+
 class LockStep:
     """The way to the program in virtual time, which stands still until the answer has arrived."""
 
