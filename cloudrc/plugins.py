@@ -38,14 +38,15 @@ PACKAGES = {
     "predictors": "cloudrc.cloud.predictors",
     "controllers": "cloudrc.cloud.controllers",
     "onboard": "cloudrc.robots.onboard",
-    "executors": "cloudrc.gym.executors",
+    "executors": "",
     "channels": "cloudrc.drivers.channels",
     "motion": "",
     "metrics": "",
     "policies": "",
 }
 """Kind of plug-in -> package that contains cloudrc's plug-ins of this kind; "" if there is none:
-cloudrc's metrics are functions, models of motion are files of robots, policies those of users."""
+cloudrc's metrics are functions, models of motion are files of robots, policies those of users.
+The package of the executors is that of a guest, which calls `provide`."""
 METHODS = {
     "estimators": ("horizon", "update", "add_applied"),
     "predictors": ("predict", "observe", "commanded", "applied", "reset"),
@@ -98,6 +99,11 @@ class Found:
             if function is None:
                 raise ValueError("there is no such function; write one")
             yield function
+
+
+def provide(kind: str, package: str) -> None:
+    """Let the modules of a guest's `package` be cloudrc's plug-ins of a kind."""
+    PACKAGES[kind] = package
 
 
 def names(kind: str) -> list[str]:
@@ -189,12 +195,14 @@ def builder(kind: str, name: str, *, look: bool = True) -> Callable[..., Any]:
     return build  # type: ignore[no-any-return]
 
 
-@cache
 def _shipped(kind: str) -> list[str]:
-    if not PACKAGES[kind]:
-        return []
-    # Not the package itself: that of executors imports gymnasium, which an image does not have.
-    folder = Path(__file__).parent.joinpath(*PACKAGES[kind].split(".")[1:])
+    return _modules(PACKAGES[kind]) if PACKAGES[kind] else []
+
+
+@cache
+def _modules(package: str) -> list[str]:
+    """Return the names of the public modules of a package, which is not imported."""
+    folder = Path(__file__).parent.joinpath(*package.split(".")[1:])
     modules = pkgutil.iter_modules([str(folder)])
     return [module.name for module in modules if not module.name.startswith("_")]
 

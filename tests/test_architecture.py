@@ -61,6 +61,22 @@ def test_the_contracts_of_imports_hold(monkeypatch, capsys):
     assert lint_imports(no_cache=True) == 0, capsys.readouterr().out
 
 
+def test_no_text_of_the_core_names_a_guest():
+    """The contract `guests` sees import statements alone."""
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+    (rule,) = (each for each in contracts["contracts"] if each["id"] == "guests")
+    guests = tuple(rule["protected_modules"])
+    knowing = tuple(name.replace(".", "/") for name in rule["allowed_importers"])
+    named = {
+        f"{place_of(path)}: {node.value}"
+        for path, tree in trees().items()
+        if not path.relative_to(ROOT).as_posix().startswith(knowing)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and str(node.value).startswith(guests)
+    }
+    assert named == set()
+
+
 def test_live_metrics_load_neither_recordings_nor_heavy_libraries():
     heavy = {"cloudrc.record", "cloudrc.config", "pydantic", "numpy"}
     program = f"import sys, cloudrc.exposition.live; print({heavy} & sys.modules.keys())"

@@ -11,6 +11,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from cloudrc import plugins
+
+plugins.provide("executors", __name__)
+
 
 class Chunk(NamedTuple):
     """What the policy sends: the actions for successive ticks."""
