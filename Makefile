@@ -27,8 +27,10 @@ SCRIPTS := .ci/run .ci/once_more images/cloud-ros/with-ros
 JOBS ?= $(shell nproc 2>/dev/null || echo 2)
 # Folder for the results of `make faults`, `make mutants` and `make nightly`.
 EVIDENCE := build/evidence
-# A failing schedule is kept in --store; in tests/faults/regressions it becomes a test.
-SEARCH = $(bin)/cloudrc faults search --jobs $(JOBS) --store $(EVIDENCE)/regressions
+# A failing schedule is kept in $(EVIDENCE)/regressions: `pytest --schedule=FILE` flies it again, and in
+# tests/faults/regressions it becomes a test.
+SEARCH = $(bin)/python -m tests.faults --jobs $(JOBS) --store $(EVIDENCE)/regressions
+NAMED = $(bin)/pytest -n $(JOBS) --dist worksteal -m fault tests/faults
 # The duration of each search of `make faults` [min], and of those for further robots.
 MINUTES ?= 5
 ROBOT_MINUTES ?= 1
@@ -142,15 +144,15 @@ test-netem-full: $(VENV)/dev ## as test-netem, and every shipped profile for a m
 faults: faults-named faults-random faults-hostile ## inject every fault, then search for MINUTES (5) each: random faults, hostile clouds
 
 faults-named: $(VENV)/dev
-	$(bin)/cloudrc faults run --all --jobs $(JOBS)
+	$(NAMED)
 
 faults-random: $(VENV)/dev
 	$(SEARCH) --minutes $(MINUTES)
 
 faults-hostile: $(VENV)/dev
-	$(SEARCH) --minutes $(MINUTES) --adversarial
+	$(SEARCH) --minutes $(MINUTES) --hostile
 	for robot in $(ROBOTS); do \
-		$(SEARCH) --minutes $(ROBOT_MINUTES) --adversarial --robot $$robot || exit 1; done
+		$(SEARCH) --minutes $(ROBOT_MINUTES) --hostile --robot $$robot || exit 1; done
 
 coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and store is tested
 	$(bin)/pytest -n auto --hypothesis-seed=0 --cov --cov-report=term $(CORE)
@@ -166,8 +168,8 @@ mutants: $(VENV)/deep ## mutate guard, tunnel and store, list the mutants that t
 
 # In this order; each part runs even if an earlier one has failed. The part on a cluster needs Docker,
 # kind, helm and kubectl.
-NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.json \
-	search-adversarial.json $(ROBOTS:%=search-%.json) search-random.json \
+NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.xml \
+	search-hostile.json $(ROBOTS:%=search-%.json) search-random.json \
 	mujoco-oldest.json mujoco-newest.json delayed-cartpole.md) \
 	mutants night-tun night-ros2 night-netem e2e-full
 
@@ -176,22 +178,22 @@ nightly: $(VENV)/deep ## run every test, search and bench; writes build/evidence
 	$(MAKE) --jobs=1 --keep-going $(NIGHT)
 
 $(EVIDENCE)/tests.xml:
-	$(bin)/pytest -n auto -m 'not process and not e2e and not netem and not tun and not ros2' --junitxml=$@
+	$(bin)/pytest -n auto -m 'not process and not e2e and not netem and not tun and not ros2' --fault-seed 2 --junitxml=$@
 
 $(EVIDENCE)/process.xml:
 	REQUIRE_ALL=1 $(bin)/pytest -m process --junitxml=$@
 
-$(EVIDENCE)/faults.json:
-	$(bin)/cloudrc faults run --all --jobs $(JOBS) -o json > $@
+$(EVIDENCE)/faults.xml:
+	$(NAMED) --junitxml=$@
 
-$(EVIDENCE)/search-adversarial.json:
-	$(SEARCH) --adversarial --minutes 5 -o json > $@
+$(EVIDENCE)/search-hostile.json:
+	$(SEARCH) --hostile --minutes 5 --json > $@
 
 $(ROBOTS:%=$(EVIDENCE)/search-%.json): $(EVIDENCE)/search-%.json:
-	$(SEARCH) --adversarial --robot $* --minutes 1 -o json > $@
+	$(SEARCH) --hostile --robot $* --minutes 1 --json > $@
 
 $(EVIDENCE)/search-random.json:
-	$(SEARCH) --minutes 10 -o json > $@
+	$(SEARCH) --minutes 10 --json > $@
 
 # The paper's mission on the oldest and on the newest MuJoCo that pyproject.toml allows.
 $(EVIDENCE)/mujoco-oldest.json: MUJOCO = mujoco==$(shell sed -n 's/.*"mujoco>=\([0-9.]*\),.*/\1/p' pyproject.toml)

@@ -66,7 +66,7 @@ SETTLE_TIME = 4.0
 """Expected extra time at the beginning and end of the way to a waypoint [s]."""
 LEG_FACTOR = 3.0
 """Time limit for the way to a waypoint, as a multiple of the expected time.
-Source: `cloudrc faults list`, "F28"."""
+Source: docs/reference/faults.md, "F28"."""
 LIMIT_MIN = 60.0
 """Smallest time limit of a mission whose order gives none [s]."""
 ONLY_MISSION = 1

@@ -17,7 +17,7 @@ from importlib.resources.abc import Traversable
 SUFFIXES = (".py", ".c", ".xml", ".yaml")
 """Endings of source files. Files that are built from them, such as *.pyc and *.so, do not count."""
 NOT_FLOWN = frozenset(
-    {"_chart", "cli", "cluster", "console", "exercise", "exposition", "faults", "studies", "trials"}
+    {"_chart", "cli", "cluster", "console", "exercise", "exposition", "studies", "trials"}
 )
 """Folders of the package from which a flight in virtual time runs nothing."""
 

@@ -21,6 +21,7 @@ from cloudrc.outside.document import write_yaml
 from cloudrc.runs.interrupts import forget_interrupt
 from tests.support.sweeps import GRID, SHORT
 
+ROOT = Path(__file__).resolve().parents[1]
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
 """The browser of Debian (`apt-get install chromium`), or that of GitHub's machines."""
@@ -64,6 +65,21 @@ def wait_until(condition, limit=120.0):
     return time.monotonic() - began
 
 
+def pytest_addoption(parser):
+    """Add what the named faults and the search for faults need."""
+    group = parser.getgroup("faults")
+    about = "fly the schedule of faults in FILE, and no other test"
+    group.addoption("--schedule", metavar="FILE", type=Path, help=about)
+    about = "seed of the named faults (default: 1)"
+    group.addoption("--fault-seed", metavar="N", type=int, default=1, help=about)
+
+
+def pytest_configure(config):
+    """Choose the test that flies the schedule, if there is one."""
+    if config.option.schedule is not None:
+        config.args[:] = [str(ROOT / "tests" / "faults" / "test_schedule_file.py")]
+
+
 needs_ipv6 = pytest.mark.skipif(not _has_ipv6(), reason="needs the IPv6 address ::1")
 
 
@@ -83,7 +99,12 @@ def pytest_sessionfinish(session):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Give each file to one process, so that what its tests share is flown once."""
+    """Give each file to one process, so that what its tests share is flown once.
+
+    With `--dist worksteal`, the tests of a file are flown side by side.
+    """
+    if config.option.dist == "worksteal":
+        return None
     from xdist.scheduler import LoadFileScheduling
 
     return LoadFileScheduling(config, log)

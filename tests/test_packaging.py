@@ -52,7 +52,10 @@ def wheel_in(folder):
     """Return the name of the wheel in `folder`, and the names of the package's files in it."""
     (wheel,) = folder.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
-        return wheel.name, {name for name in archive.namelist() if name.startswith("cloudrc/")}
+        names = set(archive.namelist())
+    about = f"{'-'.join(wheel.name.split('-')[:2])}.dist-info/"
+    assert all(name.startswith(("cloudrc/", about)) for name in names), "nothing but the package"
+    return wheel.name, {name for name in names if name.startswith("cloudrc/")}
 
 
 @pytest.fixture(scope="module", autouse=True)

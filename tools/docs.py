@@ -6,8 +6,9 @@ The tables of docs/experiment.md come from the models in `cloudrc/config/schema.
 signatures of the shipped plug-ins. The tables of docs/topics.md come from
 `cloudrc/record/topics.py`, those of docs/metrics.md from `cloudrc/exposition/table.py`. The text
 around the tables is written by hand. `QUANTITIES` gives panels to the dashboard of missions. The
-table of docs/on-call.md comes from the chart's `files/rules.yaml`. The menu of the site is the list
-of pages in docs/README.md.
+table of docs/on-call.md comes from the chart's `files/rules.yaml`, those of
+docs/reference/faults.md from the marks of the tests that inject faults. The menu of the site is the
+list of pages in docs/README.md.
 
 Each shipped robot and mission has a page of its own (`tools/guests.py`).
 
@@ -38,7 +39,7 @@ from cloudrc.exposition.table import METRICS, ROLES
 from cloudrc.metrics.definitions import QUANTITIES, RecordQuantity
 from cloudrc.outside.values import to_plain
 from cloudrc.record.topics import TOPICS
-from tools import metadata
+from tools import faults, metadata
 from tools.chart_values import added, earliest, make_schema, table_rows
 from tools.dashboards import UNITS
 from tools.guests import OWN_FLIGHTS, link, pages
@@ -135,6 +136,7 @@ def outputs() -> dict[Path, str]:
         **insert(ROOT / "docs" / "topics.md", _topics()),
         **insert(ROOT / "docs" / "metrics.md", _metrics()),
         **insert(ROOT / "docs" / "on-call.md", f"\n{_alerts()}"),
+        **insert(ROOT / "docs" / "reference" / "faults.md", _faults()),
         **pages(),
         **insert(CHART / "README.md", f"\n{rows}"),
         **insert(ROOT / "mkdocs.yml", f"{_navigation()}# "),
@@ -195,6 +197,13 @@ def _alerts() -> str:
         commands = (re.sub(r"(?<=[ (])'([^']+)'", r"`\1`", text) for text in texts)
         rows.append((f"[{name}](#{name.lower()})", *commands))
     return table("alert | meaning | first action", rows)
+
+
+def _faults() -> str:
+    others = "These need real processes, a disk or a cluster:"
+    return (
+        f"\n## In virtual time\n\n{faults.named()}\n## Elsewhere\n\n{others}\n\n{faults.others()}"
+    )
 
 
 def panels(quantities: Iterable[RecordQuantity]) -> str:

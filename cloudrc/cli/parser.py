@@ -43,7 +43,6 @@ GROUPS: dict[str, dict[str, str]] = {
         "place": "find out where the controller should run: robot, edge or cloud",
         "measure": "measure how long a controller computes",
         "identify": "fit the model of the velocity loop to a recorded flight",
-        "faults": "inject faults and check that the system handles them",
         "bench": "measure how fast the simulation runs here",
     },
     "policies": {

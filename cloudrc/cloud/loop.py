@@ -69,7 +69,7 @@ PLAN_STEP = PLAN_STEP_NS * 1e-9
 """Time between two velocities of a plan [s]."""
 PLANNED_MAX = 1000.0
 """Largest component of a planned velocity [m/s]; the guard takes no plan with a larger one.
-Source: `cloudrc faults list`, "F23"."""
+Source: docs/reference/faults.md, "F23"."""
 
 
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does

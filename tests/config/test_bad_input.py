@@ -22,6 +22,12 @@ def refused_text(path, text):
     return refused(path).replace(f"{path.parent}/", "")
 
 
+@pytest.mark.fault(
+    37,
+    "bad-configuration",
+    injects="unknown keys, wrong units, impossible limits",
+    expects="refused with the path of each key, its line and the nearest known key",
+)
 def test_all_problems_are_listed_with_their_lines(mine):
     text = refused_text(
         mine,

@@ -148,6 +148,13 @@ def test_a_loop_that_stands_still_is_not_alive(served):
     assert get(port, "/healthz") == (503, "the loop has stood still for 61 s\n")
 
 
+@pytest.mark.fault(
+    31,
+    "slow-scrapers",
+    injects="clients open requests for metrics and hold them",
+    expects="a probe is answered; the oldest connections are closed",
+    figures="200 open requests; answer within .9 s",
+)
 def test_a_burst_of_clients_that_hang_blocks_no_probe(served):
     """The oldest are closed."""
     waiting = [socket.create_connection((HOST, served[1]), timeout=0.9) for _ in range(200)]

@@ -60,6 +60,14 @@ def fly(folder):
 @pytest.mark.process
 @pytest.mark.alone
 @pytest.mark.promise("api-load-spares-the-loop")
+@pytest.mark.fault(
+    26,
+    "api-flood",
+    injects="many requests reach the operator API",
+    expects="all are answered, and the control period stays",
+    figures="1,000 requests a second; answered within 1 s; the period's error grows by at "
+    "most 2 ms",
+)
 def test_a_flood_of_requests_does_not_disturb_the_loop(tmp_path):
     """Other programs disturb calm and flooded windows alike; the medians leave out short bursts."""
     for number in range(TRIES):

@@ -52,6 +52,12 @@ def test_a_file_is_followed_twice_a_second(path, keys):
 
 
 @pytest.mark.parametrize("wrong", [b"3" * 31, "pipe"])
+@pytest.mark.fault(
+    38,
+    "secret-wrong",
+    injects="the key file is wrong",
+    expects="the keys in use stay; it is told once, and the next good file counts",
+)
 def test_a_wrong_file_leaves_the_keys_and_is_told_once(wrong, path, keys):
     """A reader of a pipe would stop the loop."""
     if wrong == "pipe":

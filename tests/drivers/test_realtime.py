@@ -101,6 +101,12 @@ class Late:
         ((LONG_NS, STALL_AGAIN_NS + MS, 0), 1, [0, MANY, 0]),
     ],
 )
+@pytest.mark.fault(
+    39,
+    "world-paused",
+    injects="a process stops for a moment",
+    expects="what has arrived meanwhile is taken in one wake",
+)
 def test_what_waited_through_a_stall_is_taken_in_one_wake(late_ns, arrive, wakes):
     with bind(("127.0.0.1", 0)) as udp, socket.socket(type=socket.SOCK_DGRAM) as sender:
         end, sent = Late(*late_ns), []

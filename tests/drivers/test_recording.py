@@ -68,6 +68,13 @@ def test_records_that_a_slow_disk_drops_are_told_and_leave_a_hole(tmp_path, monk
 
 @pytest.mark.promise("a-bad-disk-spares-the-flight")
 @pytest.mark.parametrize("room", [0, 1500, 20_000, 52_640])
+@pytest.mark.fault(
+    29,
+    "bad-disk",
+    injects="the disk of the recording is full, read-only or slow",
+    expects="no flight ends by it; dropped records are counted; the file ends with a whole chunk",
+    figures="room for 0 to 52,640 bytes",
+)
 def test_on_a_full_disk_all_is_kept_or_counted(tmp_path, room):
     path, records = tmp_path / "w.mcap", counted(3000)
     disk = Disk(room)
@@ -162,6 +169,13 @@ for n in range(10_000):
 @pytest.mark.promise("a-kill-loses-half-a-second")
 @pytest.mark.process
 @pytest.mark.parametrize(("after", "sync"), [(0.9, 0.0), (2.1, 0.4), (2.1, 60.0)])
+@pytest.mark.fault(
+    30,
+    "recorder-killed",
+    injects="SIGKILL ends the recorder, also while the disk is slow",
+    expects="what was recorded before is read",
+    figures="at most .5 s lost",
+)
 def test_sigkill_loses_at_most_half_a_second(tmp_path, after, sync):
     """`after` is the time of the kill [s], `sync` the duration of one sync to a slow disk [s]."""
     path = tmp_path / "world.mcap"

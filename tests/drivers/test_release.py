@@ -47,6 +47,13 @@ def test_the_mission_goes_on_at_the_same_waypoint(release, killed):
     assert (applied["stamp_ns"] - applied["basis_stamp_ns"]).max() <= 252_000_000
 
 
+@pytest.mark.fault(
+    33,
+    "shutdown",
+    injects="SIGTERM of teleop in a mission",
+    expects="teleop holds the robot, then ends; its successor resumes the mission",
+    figures="exit within 2 s",
+)
 def test_an_ended_teleop_holds_and_its_waiting_successor_resumes(release):
     release.fly()
     first, old = release.running["teleop"], release.url

@@ -40,7 +40,7 @@ ENDS_IN = 2.0
 """Time limit for a deleted pod to end, and for its robot to hold [s].
 Source: docs/reference/faults.md, "F33"."""
 COMMANDS_IN = 2.0
-"""Time limit for a new cloud to send commands [s]. Source: `cloudrc faults list`, "F13"."""
+"""Time limit for a new cloud to send commands [s]. Source: docs/reference/faults.md, "F13"."""
 POD_START = 10.0
 """Time that Kubernetes needs to replace a pod whose image is on the node [s]. On kind with two busy
 CPUs, 6.3 to 9.5 s were measured from the pod's deletion to the flight."""
@@ -90,6 +90,13 @@ def check_touched(name):
     assert touched.keys() <= {"floor"}
 
 
+@pytest.mark.fault(
+    14,
+    "cloud-evicted",
+    injects="the cloud pod is deleted in flight",
+    expects="HOLD; the new cloud commands, and the mission goes on",
+    figures="HOLD within 2 s",
+)
 def test_a_deleted_cloud_is_replaced_and_the_mission_goes_on(installed, note):
     fly_until("bereft", "waypoint 1 of 2 reached", waypoints=LINE)
     began = time.monotonic()
@@ -126,6 +133,12 @@ def test_a_mission_outlives_its_watcher(installed):
 
 
 @pytest.mark.full
+@pytest.mark.fault(
+    33,
+    "operator-lost",
+    injects="the Job of the mission is deleted",
+    expects="the mission ends with its lease, and the robot holds; the next mission flies",
+)
 def test_a_mission_whose_job_is_deleted_is_cancelled(installed):
     fly("leaderless", [{"position_m": [0.5, 0.0, 0.7], "dwell_s": 1000.0}], 2000.0)
     eventually(lambda: guard() == "TRACK", "the mission flies", 60.0)
@@ -137,6 +150,13 @@ def test_a_mission_whose_job_is_deleted_is_cancelled(installed):
 
 
 @pytest.mark.full
+@pytest.mark.fault(
+    38,
+    "secret-rotated",
+    injects="the Secret with the key is replaced while missions fly",
+    expects="both ends use the new key; the missions succeed",
+    figures="at most 1 HOLD",
+)
 def test_a_rotated_key_costs_one_hold_at_most(installed, tmp_path):
     secret = f"{NAME}-tunnel"
     key = tmp_path / "key"

@@ -69,6 +69,13 @@ def scaled(name, component):
     ("name", "component"),
     [("constrained-drone", "world"), *nightly_rows(("loaded-cloud", "cloud"))],
 )
+@pytest.mark.fault(
+    16,
+    "cloud-throttled",
+    injects="a CPU limit of the pod stops world or cloud again and again",
+    expects="the mission succeeds in real time",
+    figures="real-time factor at least .95",
+)
 def test_a_constrained_part_is_throttled_yet_keeps_real_time(constrained, note, name, component):
     plain = throttled(component)
     code, report = constrained(name, *scaled(name, component))
@@ -82,6 +89,13 @@ def test_a_constrained_part_is_throttled_yet_keeps_real_time(constrained, note, 
 
 
 @pytest.mark.full
+@pytest.mark.fault(
+    18,
+    "world-overloaded",
+    injects="world gets less CPU than real time needs",
+    expects="the run says that it is invalid",
+    figures="exit code 6",
+)
 def test_a_world_that_cannot_keep_up_says_invalid(constrained):
     code, report = constrained("invalid")
     assert (code, report["verdict"]) == (6, "invalid")

@@ -13,12 +13,11 @@ import yaml
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.exposition.parts import Histogram
 from cloudrc.exposition.table import METRICS
-from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.scenarios import SCENARIOS
-from cloudrc.faults.schedule import Schedule
-from cloudrc.faults.search import run_fault
 from cloudrc.records import Counted
 from tests.conftest import nightly
+from tests.faults.flight import FaultRun
+from tests.faults.scenarios import SCENARIOS
+from tests.faults.schedule import Schedule
 
 ROOT = Path(__file__).resolve().parents[2]
 RULES = ROOT / "charts" / "cloudrc" / "files" / "rules.yaml"
@@ -138,7 +137,7 @@ def flights(monkeypatch):
 
 @pytest.mark.parametrize("scenario", FLOWN)
 def test_a_fault_fires_its_alerts_and_no_others(scenario, flights, tmp_path):
-    run_fault(scenario.name, 1)
+    scenario.run(1)
     found = [fired(flight, tmp_path) for flight in flights if flight.of_world]
     assert sorted(set[str]().union(*found)) == FIRES.get(scenario.id, [])
 

@@ -10,12 +10,12 @@ from types import SimpleNamespace
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.faults.invariants import FlightSteps
-from cloudrc.faults.observer import RobotObserver
-from cloudrc.faults.rules import ESTOP, FLOWN, GROUND, HOLD, LAND, TRACK, Rules
 from cloudrc.messages import ZERO, Command, OperatorRequest, Request, Start
 from cloudrc.records import Contact
 from cloudrc.robots.pelican.rotors import STOPPED
+from tests.faults.invariants import FlightSteps
+from tests.faults.observer import RobotObserver
+from tests.faults.rules import ESTOP, FLOWN, GROUND, HOLD, LAND, TRACK, Rules
 
 MS = 1_000_000
 

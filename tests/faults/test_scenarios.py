@@ -4,19 +4,29 @@
 
 import pytest
 
-from cloudrc.faults.measures import Requirement
-from cloudrc.faults.scenarios import SCENARIOS
-from cloudrc.faults.search import run_fault
-from tests.conftest import nightly
+from tests.faults.measures import Requirement
+from tests.faults.scenarios import SCENARIOS
+from tools import faults
 
 QUICK = "world-restarted"
 
 
-@pytest.mark.parametrize("name", [QUICK, *nightly(*sorted(SCENARIOS.keys() - {QUICK}))])
-def test_a_fault_passes_its_checks(name):
-    outcome = run_fault(name, 2)
+def marked(scenario):
+    """Return a fault as a value of a parametrized test; only `QUICK` is injected daily."""
+    told = {"injects": scenario.injects, "expects": scenario.expects}
+    marks = [pytest.mark.fault(scenario.number, scenario.name, **told)]
+    marks += [] if scenario.name == QUICK else [pytest.mark.full]
+    return pytest.param(scenario, id=f"{scenario.id}-{scenario.name}", marks=marks)
+
+
+@pytest.mark.parametrize("scenario", [*map(marked, SCENARIOS.values())])
+def test_a_fault_passes_its_checks(scenario, fault_seed, record_property):
+    outcome = scenario.run(fault_seed)
+    record_property("records_sha256", outcome.sha256)
+    for check in outcome.checks:
+        record_property(check.text, check.shown)
     assert [check.show() for check in outcome.checks if not check.passed] == []
-    assert outcome.passed, outcome.error
+    assert outcome.checks
 
 
 @pytest.mark.parametrize(
@@ -28,9 +38,14 @@ def test_a_fault_passes_its_checks(name):
 )
 def test_only_the_checks_of_a_broken_promise_fail(name, broken, value, said, monkeypatch):
     monkeypatch.setattr(f"cloudrc.world.{broken}", value)
-    failed = [check.text for check in run_fault(name, 1).checks if not check.passed]
+    outcome = SCENARIOS[name].run(1)
+    failed = [check.text for check in outcome.checks if not check.passed]
     assert failed[-1] == said
     assert set(failed) <= {said, "the new process commands after"}
+
+
+def test_every_number_has_a_test():
+    assert faults.numbers() == set(range(1, faults.LAST + 1))
 
 
 @pytest.mark.parametrize("measured", [float("inf"), float("nan")])

@@ -4,8 +4,8 @@
 
 import pytest
 
-from cloudrc.faults.adversary import POLICIES, choose
-from cloudrc.faults.schedule import CALM, KINDS, compose, dump, load
+from tests.faults.adversary import POLICIES, choose
+from tests.faults.schedule import CALM, KINDS, compose, dump, load
 
 
 @pytest.mark.parametrize("draw", [compose, choose])

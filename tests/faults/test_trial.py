@@ -9,11 +9,6 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.cloud.operator import EmergencyStopRepeater
-from cloudrc.faults import trial
-from cloudrc.faults.adversary import POLICIES, choose
-from cloudrc.faults.invariants import check_order
-from cloudrc.faults.schedule import FaultEvent, Schedule, compose, load
-from cloudrc.faults.trial import fly
 from cloudrc.messages import ZERO
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
@@ -22,6 +17,11 @@ from cloudrc.world.guard import limits
 from cloudrc.world.guard.hold import PositionHold
 from cloudrc.world.guard.state import Guard
 from tests.conftest import nightly
+from tests.faults import trial
+from tests.faults.adversary import POLICIES, choose
+from tests.faults.invariants import check_order
+from tests.faults.schedule import FaultEvent, Schedule, compose, load
+from tests.faults.trial import fly
 
 MS = 1_000_000
 REGRESSIONS = sorted((Path(__file__).parent / "regressions").glob("*.yaml"))

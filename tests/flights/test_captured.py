@@ -4,9 +4,9 @@
 
 import pytest
 
-from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.schedule import Schedule
 from cloudrc.tunnel.codec import Kind, peek
+from tests.faults.flight import FaultRun
+from tests.faults.schedule import Schedule
 
 HOVER = (
     "mission.waypoints=[{position_m: [0.5, 0, 0.8], dwell_s: 1}]",
@@ -27,7 +27,7 @@ class Tapped(FaultRun):
     def replay(self, heard):
         for name, end in self.ends.items():
             for data in heard[name]:
-                end.receive_now(data, self.run.now_ns)
+                end.pass_on(data, self.run.now_ns)
 
     def accepted(self):
         """Return the counts of accepted datagrams, and the epochs."""

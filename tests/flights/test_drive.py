@@ -7,8 +7,6 @@ from math import radians
 import numpy as np
 import pytest
 
-from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.schedule import Schedule, generator
 from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.record.columns import Recording
@@ -18,6 +16,8 @@ from cloudrc.report.write import write_report
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.wire import Leg
 from tests.conftest import nightly
+from tests.faults.flight import FaultRun
+from tests.faults.schedule import Schedule, generator
 from tests.flights.conftest import fly
 
 EAST, WEST, UP = (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.0, 0.0, 0.5)

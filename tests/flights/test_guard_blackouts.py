@@ -7,14 +7,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from cloudrc.faults import measures
-from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.schedule import FaultEvent, Schedule
 from cloudrc.geometry.clearance import inside_tube
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
 from cloudrc.records import GroundTruth
 from tests.conftest import nightly
+from tests.faults import measures
+from tests.faults.flight import FaultRun
+from tests.faults.schedule import FaultEvent, Schedule
 
 COUNT = 200
 SLOW = ("cloud.controller.speed_max=1.5",)

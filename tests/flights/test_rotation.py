@@ -6,12 +6,12 @@ from itertools import pairwise
 
 import pytest
 
-from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.inject import SECRET
-from cloudrc.faults.measures import epochs
-from cloudrc.faults.schedule import Schedule
 from cloudrc.messages import GuardState
 from cloudrc.tunnel.keys import Key, KeySet
+from tests.faults.flight import FaultRun
+from tests.faults.inject import SECRET
+from tests.faults.measures import epochs
+from tests.faults.schedule import Schedule
 
 NEW = KeySet(Key(b"n" * 32), SECRET.current)
 ONLY = KeySet(NEW.current)

@@ -151,6 +151,13 @@ def test_where_netem_fails_auto_takes_the_relay_and_netem_ends(tmp_path, refuses
     assert not bench.route.exists()
 
 
+@pytest.mark.fault(
+    19,
+    "dns-failure",
+    injects="the peer's name does not resolve at first, later it has a new address",
+    expects="the link waits, then follows the address; its time line keeps its start",
+    figures="2 s without an address",
+)
 def test_the_peer_is_waited_for_and_its_new_address_followed(tmp_path):
     """The time line keeps its start when another shaper takes over."""
     bench = Bench(tmp_path, "auto")

@@ -59,6 +59,13 @@ def test_a_mission_from_post_to_verdict(api):
     assert api.post("/v1/missions/m99/cancel")[0] == 404
 
 
+@pytest.mark.fault(
+    34,
+    "second-mission",
+    injects="another mission is posted during a mission",
+    expects="the new mission is refused, with the name of the one that flies",
+    figures="status 409",
+)
 def test_the_operator_steers_and_a_conflict_names_its_mission(api):
     assert api.post("/v1/resume")[0] == 409
     mission_id, (point,) = api.fly(MISSION), A_MISSION["waypoints"]

@@ -241,6 +241,14 @@ def test_the_verdict_of_a_failed_mission_tells_its_interruptions(script, codes, 
     assert words in "; ".join(failure["text"] for failure in told)
 
 
+@pytest.mark.fault(
+    35,
+    "job-twice",
+    injects="the same mission is posted several times with the same key, also after a "
+    "restart of teleop",
+    expects="one mission; every client gets it",
+    figures="4 orders",
+)
 def test_a_key_is_that_of_one_order_for_ever():
     flight, mission_id = service_flying(key="uid")
     play(flight, "A B C")

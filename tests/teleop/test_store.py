@@ -92,6 +92,12 @@ def execute(path, statement):
         lambda path: execute(path, "UPDATE missions SET plan = '[1, {}]'"),
     ],
 )
+@pytest.mark.fault(
+    36,
+    "torn-journal",
+    injects="the journal of the missions is damaged",
+    expects="teleop keeps the file aside, says so, and begins a new journal",
+)
 def test_a_damaged_file_is_set_aside_and_named(path, damage):
     begun(path)
     damage(path)
@@ -134,6 +140,12 @@ def test_the_number_of_missions_and_events_is_bounded():
     models.MissionView.model_validate(view)
 
 
+@pytest.mark.fault(
+    32,
+    "slow-reader",
+    injects="a reader of the event stream does not read",
+    expects="only this reader misses events, the oldest first, and they are counted",
+)
 def test_a_reader_that_was_away_misses_what_was_forgotten():
     store = MissionStore(connect(), b"")
     first, second = store.add(ORDER), store.add(ORDER)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Numbers of the link, the gym, evaluations, sweeps and studies, and the named faults."""
+"""Numbers of the link, the gym, evaluations, sweeps and studies."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ PROFILES = (
 )
 PACKETS, PERIOD_NS, SIZE = 2000, 10_000_000, 300
 EXECUTORS = "single", "newest", "prefix", "time_indexed", "ensemble", "broker"
-FAULTS = 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 15, 17, 20, 21, 22, 23, 24, 25, 27, 28, 40
 SWEEP = {
     "experiment": "steps",
     "set": {"mission.steps.count": 2},
@@ -163,6 +162,4 @@ def tasks() -> dict[str, Callable[[], Any]]:
     found |= {f"eval {name}": partial(evaluate, name) for name in EXECUTORS}
     found |= {f"networked {name}": partial(networked, name) for name in EXECUTORS[1:]}
     found |= {"vector": vector, "sweep": sweep, "identify": identify, "class check": exercise}
-    for number in FAULTS:
-        found[f"fault F{number}"] = partial(document, "faults", "run", f"F{number}")
     return found

@@ -43,8 +43,6 @@ run steps --mode virtual --set mission.steps.count=1 -o json --out b
 run paper --mode virtual --set link.profile=ideal --set cloud.predictor=last_sample --out c
 run steps --seeds 2 --set mission.steps.count=1
 new robot mine
-faults list
-faults run missing-key
 key new --help
 completion bash
 class new course
@@ -95,7 +93,6 @@ margin link.both.delay_ms --seeds 0
 eval --env CartPole-v1
 eval --env CartPole-v1 --policy nothing.py
 eval --env Nothing-v0 --policy ./law.py
-faults run nothing
 class check nothing
 robot check nothing
 mission run nothing --run nothing

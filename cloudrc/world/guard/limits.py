@@ -166,7 +166,7 @@ RAMP_MIN = 1.0
 COMMAND_MAX = 1000.0
 """Largest component of a command that the guard accepts [m/s, rad/s]. A command with a larger
 component comes from a bug, so its direction cannot be trusted either.
-Source: `cloudrc faults list`, "F23"."""
+Source: docs/reference/faults.md, "F23"."""
 
 
 def ramp_ns(speed_max: float, braking: float) -> int:

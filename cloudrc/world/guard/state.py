@@ -78,12 +78,12 @@ RESUME_NS = 500_000_000
 Source: docs/safety.md, "Leaving HOLD"."""
 SETTLE_NS = 1_000_000_000
 """Shortest time between the beginnings of two HOLDs, and between those of two TRACKs [ns].
-Source: docs/safety.md, "Settling time"; `cloudrc faults list`, "F5"."""
+Source: docs/safety.md, "Settling time"; docs/reference/faults.md, "F5"."""
 INVALID_COMMANDS = 5
 IMPOSSIBLE = f"{INVALID_COMMANDS} impossible commands within 1 s"
 INVALID_NS = 1_000_000_000
 """INVALID_COMMANDS impossible commands within INVALID_NS [ns] lead to LAND.
-Source: `cloudrc faults list`, "F23"."""
+Source: docs/reference/faults.md, "F23"."""
 FOREVER_NS = 1 << 62
 """Stamp later than all others [ns]: no further velocity of a plan is due."""
 NO_COMMAND = Command(NEVER_NS, NEVER_NS, 0, ZERO, 0.0)

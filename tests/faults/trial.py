@@ -14,15 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from cloudrc.errors import describe_error
-from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.inject import order
-from cloudrc.faults.invariants import FlightSteps
-from cloudrc.faults.measures import events_of_missions, held
-from cloudrc.faults.rules import ESTOP, LATCHED, TRACK, Breach
-from cloudrc.faults.schedule import Schedule
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.wire import QUEUED
 from cloudrc.text import escape
+from tests.faults.flight import FaultRun
+from tests.faults.inject import order
+from tests.faults.invariants import FlightSteps
+from tests.faults.measures import events_of_missions, held
+from tests.faults.rules import ESTOP, LATCHED, TRACK, Breach
+from tests.faults.schedule import Schedule
 
 INVARIANTS = {
     "collision": "collisions",

@@ -6,8 +6,10 @@ from __future__ import annotations
 
 from math import isnan, nan
 
-from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.measures import (
+from cloudrc.messages import Cause, GuardState
+from cloudrc.records import Arrival, Control, GroundTruth
+from tests.faults.flight import FaultRun
+from tests.faults.measures import (
     Outcome,
     busiest_second,
     calm_after,
@@ -17,9 +19,7 @@ from cloudrc.faults.measures import (
     number,
     scenario,
 )
-from cloudrc.faults.schedule import WAYS, FaultEvent
-from cloudrc.messages import Cause, GuardState
-from cloudrc.records import Arrival, Control, GroundTruth
+from tests.faults.schedule import WAYS, FaultEvent
 
 HOUR = 3600.0  # [s]
 STEADY = "link.both.jitter_ms=0"

@@ -1,21 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Define a named fault, its checks and their result as JSON; measure flights for the checks."""
+"""Define a named fault, its checks and their result; measure flights for the checks."""
 
 from __future__ import annotations
 
 import hashlib
 import operator
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from math import dist, hypot, isfinite, nan
 from typing import Any, Literal, TypeAlias
 
-from cloudrc.faults.adversary import Lie
-from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.schedule import Schedule, generator
 from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.records import (
@@ -28,7 +25,9 @@ from cloudrc.records import (
 )
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
-from cloudrc.text import Paint, escape, plain
+from tests.faults.adversary import Lie
+from tests.faults.flight import FaultRun
+from tests.faults.schedule import Schedule, generator
 
 Relation: TypeAlias = Literal["<=", ">=", "=="]
 _COMPARE = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
@@ -57,13 +56,18 @@ class Requirement:
         """Whether `measured` complies with `limit`; False if it is not finite (not measured)."""
         return isfinite(self.measured) and bool(_COMPARE[self.relation](self.measured, self.limit))
 
-    def show(self) -> str:
-        """Format the check on one line: its text, the measured value and the limit."""
+    @property
+    def shown(self) -> str:
+        """The measured value beside its limit, such as "0.251 s (<= 0.252)"."""
         if self.unit == YES:
-            return f"{self.text}: {'yes' if self.measured else 'NO'}"
+            return "yes" if self.measured else "NO"
         unit = f" {self.unit}" if self.unit else ""
         sign = "" if self.relation == "==" else f"{self.relation} "
-        return f"{self.text}: {self.measured:.4g}{unit} ({sign}{self.limit:.4g})"
+        return f"{self.measured:.4g}{unit} ({sign}{self.limit:.4g})"
+
+    def show(self) -> str:
+        """Format the check on one line: its text, the measured value and the limit."""
+        return f"{self.text}: {self.shown}"
 
 
 @dataclass(slots=True)
@@ -72,8 +76,6 @@ class Outcome:
 
     checks: list[Requirement] = field(default_factory=list)
     sha256: str = ""  # hash of the records of all its flights
-    seconds: float = 0.0  # how long it ran [s]
-    error: str = ""  # the exception that ended it, if any
     seed: int = 1  # of all its flights
 
     def most(self, text: str, measured: float, limit: float, unit: str = "") -> None:
@@ -140,16 +142,6 @@ class Outcome:
         """Check that every HOLD began within one step after the last command became too old."""
         self.most(text, basis_age_at_hold(flight), AGE_MAX, "s")
 
-    @property
-    def passed(self) -> bool:
-        """Whether the scenario ran to its end, with at least one check, and all checks passed."""
-        return not self.error and bool(self.checks) and all(each.passed for each in self.checks)
-
-    @property
-    def word(self) -> str:
-        """The result as a word for a table, passed or FAILED."""
-        return "passed" if self.passed else "FAILED"
-
 
 Inject: TypeAlias = Callable[[Outcome], None]
 """Function that injects a fault into flights with the seed of an outcome, and adds checks."""
@@ -160,7 +152,7 @@ class Scenario:
     """A fault, how to inject it, and the reaction that the robot has to show."""
 
     number: int  # 13 for F13
-    name: str  # on the command line: cloud-killed
+    name: str  # such as cloud-killed
     injects: str
     expects: str  # what the robot does, and within what time
     inject: Inject
@@ -170,29 +162,11 @@ class Scenario:
         """Number of the fault with its letter, such as F13."""
         return f"F{self.number}"
 
-    def as_lines(self, outcome: Outcome, paint: Paint = plain, *, briefly: bool) -> Iterator[str]:
-        """Describe one result of this scenario in lines, `briefly` without the checks it passed."""
-        word = paint(outcome.word, "green" if outcome.passed else "red")
-        sha = f"  {outcome.sha256[:12]}" if outcome.sha256 else ""
-        yield f"{word:8} {self.id:4} {self.name:26} {outcome.seconds:6.1f} s{sha}"
-        if outcome.error:
-            yield f"           {escape(outcome.error)}"
-        for check in outcome.checks:
-            if not (briefly and check.passed):
-                yield f"         {'' if check.passed else 'x '}{escape(check.show())}"
-
-    def as_json(self, outcome: Outcome) -> dict[str, Any]:
-        """Return one result of this scenario as values for a JSON document."""
-        return {
-            "id": self.id,
-            "name": self.name,
-            "mode": "virtual",
-            "result": outcome.word.lower(),
-            "reason": outcome.error,
-            "seconds": round(outcome.seconds, 3),
-            "records_sha256": outcome.sha256,
-            "checks": [asdict(check) | {"passed": check.passed} for check in outcome.checks],
-        }
+    def run(self, seed: int) -> Outcome:
+        """Inject the fault into flights with this seed, and measure how the robot reacts."""
+        outcome = Outcome(seed=seed)
+        self.inject(outcome)
+        return outcome
 
 
 def scenario(number: int, name: str, *, injects: str, expects: str) -> Callable[[Inject], Scenario]:

@@ -14,8 +14,13 @@ from cloudrc.config.load import read_experiment
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import MissionConfig
-from cloudrc.faults.adversary import Lie
-from cloudrc.faults.measures import (
+from cloudrc.geometry.obstacles import fence_of
+from cloudrc.geometry.scene import Tube
+from cloudrc.messages import Command, GuardState, Vector
+from cloudrc.records import CommandApplied, Control, Fault, GroundTruth
+from cloudrc.tunnel.handshake import BUSY_TEXT
+from tests.faults.adversary import Lie
+from tests.faults.measures import (
     AGE_MAX,
     Outcome,
     changes_into,
@@ -26,12 +31,7 @@ from cloudrc.faults.measures import (
     scenario,
     told,
 )
-from cloudrc.faults.schedule import FaultEvent, Way, generator
-from cloudrc.geometry.obstacles import fence_of
-from cloudrc.geometry.scene import Tube
-from cloudrc.messages import Command, GuardState, Vector
-from cloudrc.records import CommandApplied, Control, Fault, GroundTruth
-from cloudrc.tunnel.handshake import BUSY_TEXT
+from tests.faults.schedule import FaultEvent, Way, generator
 
 IMPOSSIBLE: dict[str, dict[str, Any]] = {
     "NaN": {"velocity": (nan, 0.0, 0.0)},

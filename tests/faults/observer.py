@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.faults.rules import ESTOP, FLOWN, GROUND, HOLD, LAND, LATCHED, TRACK, Breach, Rules
 from cloudrc.messages import PLAN_STEP_NS, Command, GuardState, OperatorRequest, Request, Start
 from cloudrc.records import Contact
 from cloudrc.sim.onboard import Commands
 from cloudrc.sim.readings import Readings
 from cloudrc.world.robot import Observer, Robot
+from tests.faults.rules import ESTOP, FLOWN, GROUND, HOLD, LAND, LATCHED, TRACK, Breach, Rules
 
 RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
 """Number of fresh commands that end a HOLD, and the time within which they must arrive [ns]."""

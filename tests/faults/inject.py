@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cloudrc.drivers.virtual import Clock
-from cloudrc.faults.adversary import Lie
-from cloudrc.faults.models import Tamper
-from cloudrc.faults.schedule import FaultEvent, Schedule, generator
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
 from cloudrc.messages import Command
 from cloudrc.records import Control
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.keys import Key, KeySet
+from tests.faults.adversary import Lie
+from tests.faults.models import Tamper
+from tests.faults.schedule import FaultEvent, Schedule, generator
 
 if TYPE_CHECKING:
-    from cloudrc.faults.flight import FaultRun
+    from tests.faults.flight import FaultRun
 
 SECRET = KeySet(Key(b"a key of the fault suite, 32 b.."))
 CAPTURED = 2_000  # number of datagrams that an intruder keeps

@@ -7,13 +7,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from itertools import islice
 
-from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.inject import flipped
-from cloudrc.faults.measures import Outcome, epochs, scenario, told
-from cloudrc.faults.models import Tamper
-from cloudrc.faults.schedule import FaultEvent, Schedule, generator
 from cloudrc.records import GroundTruth
 from cloudrc.tunnel import codec
+from tests.faults.flight import FaultRun
+from tests.faults.inject import flipped
+from tests.faults.measures import Outcome, epochs, scenario, told
+from tests.faults.models import Tamper
+from tests.faults.schedule import FaultEvent, Schedule, generator
 
 FLOOD = 100  # datagrams of garbage per honest one: 10,000 in a second
 SETTLED = 2.0

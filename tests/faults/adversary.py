@@ -19,7 +19,6 @@ import numpy as np
 
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
-from cloudrc.faults.schedule import DURATION, PAPER, Schedule, compose, generator
 from cloudrc.geometry.fence import Fence
 from cloudrc.messages import (
     MISSION_OVER,
@@ -36,6 +35,7 @@ from cloudrc.outside.refusal import check_names
 from cloudrc.records import Control, Fault
 from cloudrc.teleop.wire import Output, RobotStatus
 from cloudrc.world.robot import STEP_NS
+from tests.faults.schedule import DURATION, PAPER, Schedule, compose, generator
 
 Generator: TypeAlias = np.random.Generator
 Lie: TypeAlias = Callable[[Command, Control], Command]

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from cloudrc.faults.measures import Scenario
-from cloudrc.faults.scenarios import ends, intruder, links
+from tests.faults.measures import Scenario
+from tests.faults.scenarios import ends, intruder, links
 
 _FOUND = [
     each

@@ -11,14 +11,12 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from cloudrc.errors import CloudrcError, describe_error
-from cloudrc.faults import trial
-from cloudrc.faults.adversary import choose
-from cloudrc.faults.measures import Outcome
-from cloudrc.faults.scenarios import SCENARIOS
-from cloudrc.faults.schedule import compose, dump
-from cloudrc.faults.trial import INVARIANTS, TrialResult, checked_in
+from cloudrc.errors import CloudrcError
 from cloudrc.trials.workers import map_in_order, take_each
+from tests.faults import trial
+from tests.faults.adversary import choose
+from tests.faults.schedule import compose, dump
+from tests.faults.trial import INVARIANTS, TrialResult, checked_in
 
 
 def search(
@@ -62,9 +60,9 @@ def search(
     return found, stopped
 
 
-def fly_seed(seed: int, adversarial: bool, robot: str) -> TrialResult:
+def fly_seed(seed: int, hostile: bool, robot: str) -> TrialResult:
     """Fly the schedule for a seed: random faults, or a dishonest cloud with or without faults."""
-    return trial.fly(replace((choose if adversarial else compose)(seed), robot=robot))
+    return trial.fly(replace((choose if hostile else compose)(seed), robot=robot))
 
 
 def _count(found: dict[str, Any], finding: TrialResult) -> None:
@@ -116,17 +114,3 @@ def search_summary(document: dict[str, Any]) -> str:
         f"{document['missions_done']} missions done, nearest to the fence "
         f"{document['smallest_margin_m']:.3f} m, fastest {document['largest_speed_mps']:.2f} m/s"
     )
-
-
-def run_fault(name: str, seed: int) -> Outcome:
-    """Inject one named fault, check the reaction, and measure how long that takes.
-
-    An exception becomes the outcome's `error`.
-    """
-    began, outcome = time.monotonic(), Outcome(seed=seed)
-    try:
-        SCENARIOS[name].inject(outcome)
-    except Exception as error:  # the other scenarios still run
-        outcome.error = describe_error(error)
-    outcome.seconds = time.monotonic() - began
-    return outcome

@@ -25,7 +25,7 @@ order      Each applied command is newer than the last one, and not of an old se
 tick       The guard runs once in each step of the physics.
 
 All limits come from configuration, robot and docs/, not from the guard: from "The guard" in
-safety.md, and F5 and F23 of `cloudrc faults list`. `observer` checks, during the flight, commands
+safety.md, and F5 and F23 of faults.md. `observer` checks, during the flight, commands
 that world accepts and changes of the guard's state (stale, latch and hold). This module checks all
 else in the rows that it has kept.
 """
@@ -39,12 +39,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.faults.observer import LONG_NS, ROW, RobotObserver
-from cloudrc.faults.rules import ESTOP, FLOWN, HOLD, LAND, TRACK, Breach, Rules
 from cloudrc.messages import GuardState
 from cloudrc.records import CommandApplied, Record, SessionOpened
 from cloudrc.text import describe_point
 from cloudrc.world.robot import STEP, STEP_NS
+from tests.faults.observer import LONG_NS, ROW, RobotObserver
+from tests.faults.rules import ESTOP, FLOWN, HOLD, LAND, TRACK, Breach, Rules
 
 SLACK = 1e-9  # tolerance for rounding [m/s]
 STILL = 0.12

@@ -25,13 +25,6 @@ from cloudrc.config.schema import World
 from cloudrc.drivers.teleop import PERIOD_NS as WAKE_NS
 from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.endpoint import Endpoint
-from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, dishonesty
-from cloudrc.faults.inject import BUGS, SECRET, bugs, inject, shaped
-from cloudrc.faults.invariants import FlightSteps, check_order
-from cloudrc.faults.models import RestartableEndpoint, TeleopModel
-from cloudrc.faults.observer import RobotObserver
-from cloudrc.faults.rules import Breach, Rules
-from cloudrc.faults.schedule import OFFSET_MAX, Schedule, generator
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.messages import GuardState
@@ -43,6 +36,13 @@ from cloudrc.tunnel.end import Identity
 from cloudrc.tunnel.keys import KeyRing, KeySet
 from cloudrc.world.endpoint import WorldEndpoint
 from cloudrc.world.robot import Robot
+from tests.faults.adversary import DishonestLoop, HostileOperator, Lie, dishonesty
+from tests.faults.inject import BUGS, SECRET, bugs, inject, shaped
+from tests.faults.invariants import FlightSteps, check_order
+from tests.faults.models import RestartableEndpoint, TeleopModel
+from tests.faults.observer import RobotObserver
+from tests.faults.rules import Breach, Rules
+from tests.faults.schedule import OFFSET_MAX, Schedule, generator
 
 _Kind = TypeVar("_Kind")
 
