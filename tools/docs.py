@@ -202,7 +202,7 @@ def _alerts() -> str:
 def _faults() -> str:
     others = "These need real processes, a disk or a cluster:"
     return (
-        f"\n## In virtual time\n\n{faults.named()}\n## Elsewhere\n\n{others}\n\n{faults.others()}"
+        f"\n### In virtual time\n\n{faults.named()}\n### Elsewhere\n\n{others}\n\n{faults.others()}"
     )
 
 
@@ -232,7 +232,11 @@ def _keys(model: type[BaseModel], chosen: list[str] | None = None) -> str:
     """Format the table of a model's keys; with `chosen`, only these keys and those below them."""
     defined = model.model_json_schema()
     paths = keys_of(defined, defined, apart=PARTS)
-    rows = [_row(path, part, defined) for path, part in paths if not chosen or path[0] in chosen]
+    rows = [
+        _row(path, part, defined)
+        for path, part in paths
+        if not chosen or path[0].removesuffix("[]") in chosen
+    ]
     return table("key | value | unit | default | meaning", rows)
 
 

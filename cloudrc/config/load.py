@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
 from cloudrc.config.compute import compute_times
+from cloudrc.config.faults import NOT_IN_CLUSTER
 from cloudrc.config.ground import put_on_ground
 from cloudrc.config.heading import without_held_yaws
 from cloudrc.config.mission_check import check_mission, check_scene
@@ -268,7 +269,10 @@ def load_link(file: Path, experiment: Path) -> Profile:
     if name := document.get("profile"):
         shipped.check_name("profile", str(name))
         return load_profile(str(name))
-    return _link_of(read_document(experiment, experiment.name), experiment.name)
+    flown = read_document(experiment, experiment.name)
+    if flown.get("faults"):
+        raise BadInputError(f"{experiment.name}: faults: {NOT_IN_CLUSTER}")
+    return _link_of(flown, experiment.name)
 
 
 def _link_of(document: Document, name: str) -> Profile:

@@ -15,7 +15,7 @@ from pydantic import Discriminator, Tag, model_validator
 
 from cloudrc.config import problems, shipped
 from cloudrc.config.problems import ConfigProblem
-from cloudrc.config.section import Section, leave_out_null
+from cloudrc.config.section import Section, leave_out_empty
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import CLOUD_TIME_MAX as CLOUD_TIME_MAX
 from cloudrc.link.profile import COMMAND_AGE_MS as COMMAND_AGE_MS
@@ -91,7 +91,7 @@ class DirectionConfig(Section, DirectionKeys):
     blackouts: tuple[BlackoutConfig, ...] = ()
 
     _agree = model_validator(mode="after")(_refuse_conflict)
-    _write = leave_out_null(*LATER_KEYS)
+    _write = leave_out_empty(*LATER_KEYS)
 
 
 def _start_tag(value: Any) -> str:

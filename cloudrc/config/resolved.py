@@ -9,8 +9,15 @@ from math import inf, sqrt
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import Field, ValidationInfo, ValidatorFunctionWrapHandler, field_validator
+from pydantic import (
+    Field,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+    model_validator,
+)
 
+from cloudrc.config.faults import refusal, with_faults
 from cloudrc.config.profile import DIRECTIONS, RANDOM, CloudTime, CommandAge, DirectionConfig
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, known_robot
 from cloudrc.config.scene import scene_of
@@ -139,20 +146,31 @@ class ResolvedExperiment(Experiment):
         """Name of the robot's random numbers; "" for robot 0."""
         return f"robot {self.fleet.only}" if self.fleet.only else ""
 
+    @model_validator(mode="after")
+    def _refuse_faults(self) -> ResolvedExperiment:
+        link = self.link
+        goes_round = link.start_s == RANDOM
+        if text := refusal(self.faults, link.uplink, link.downlink, goes_round=goes_round):
+            raise ValueError(text)
+        return self
+
     @property
     def uplink(self) -> DirectionConfig:
         """Conditions of the link from world to cloud."""
-        return self._acting(self.link.uplink)
+        return self._acting("uplink")
 
     @property
     def downlink(self) -> DirectionConfig:
         """Conditions of the link from cloud to world."""
-        return self._acting(self.link.downlink)
+        return self._acting("downlink")
 
-    def _acting(self, way: DirectionConfig) -> DirectionConfig:
-        """Return a direction whose time line goes round if it begins at random."""
-        goes_round = self.link.start_s == RANDOM and way.may_repeat
-        return way.model_copy(update={"loop": True}) if goes_round else way
+    def _acting(self, name: str) -> DirectionConfig:
+        """Return a direction with its faults; its time line goes round if it begins at random."""
+        way: DirectionConfig = getattr(self.link, name)
+        if self.link.start_s == RANDOM:
+            return way.model_copy(update={"loop": True}) if way.may_repeat else way
+        faults = [fault for fault in self.faults if fault.direction in ("both", name)]
+        return with_faults(way, faults, self.link.start_s or 0.0) if faults else way
 
     @property
     def network(self) -> str:
@@ -164,9 +182,12 @@ class ResolvedExperiment(Experiment):
 
     @property
     def link_values(self) -> dict[str, Any]:
-        """Content of a profile of this link, without defaults."""
+        """Content of a profile of this link with its faults, without defaults."""
+        link = self.link
+        if self.faults:
+            link = link.model_copy(update={"uplink": self.uplink, "downlink": self.downlink})
         keys = {*DIRECTIONS, "start_s"}
-        return self.link.model_dump(mode="json", include=keys, exclude_defaults=True)
+        return link.model_dump(mode="json", include=keys, exclude_defaults=True)
 
 
 def bounds_of(world: World, *, has_speed: bool = False) -> Bounds:

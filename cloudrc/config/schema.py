@@ -26,9 +26,10 @@ from pydantic import (
 )
 
 from cloudrc.config.disturbances import Plant, SensorsConfig, WindConfig
+from cloudrc.config.faults import FaultConfig
 from cloudrc.config.fleet import CellConfig, FleetConfig
 from cloudrc.config.profile import CloudTime, CommandAge, DirectionConfig, StartConfig
-from cloudrc.config.section import Section, leave_out_null
+from cloudrc.config.section import Section, leave_out_empty
 from cloudrc.geometry.fence import Corners, order_of
 from cloudrc.link.profile import NotNegative as NotNegative
 from cloudrc.link.profile import Positive as Positive
@@ -327,7 +328,7 @@ class Link(Section):
     """Where in the time line of the link the flight begins [s], or random: drawn from the seed, and
     the line goes round. null: the profile's value, else 0"""
 
-    _write = leave_out_null("start_s")
+    _write = leave_out_empty("start_s")
 
     @model_validator(mode="after")
     def _refuse_start(self) -> Link:
@@ -487,3 +488,7 @@ class Experiment(Section):
     fleet: FleetConfig = FleetConfig()
     criteria: Criteria = Criteria()
     report: Report = Report()
+    faults: tuple[FaultConfig, ...] = ()
+    """Faults that are injected in flight, in any order"""
+
+    _write = leave_out_empty("faults")

@@ -59,13 +59,15 @@ class Described(BaseModel):
         return schema
 
 
-def leave_out_null(*keys: str) -> Any:
-    """Let a section leave out these keys where they are null, so that its hash stays."""
+def leave_out_empty(*keys: str) -> Any:
+    """Let a section leave out these keys where they are null or (), so that its hash stays."""
 
     def write(self: BaseModel, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         written: dict[str, Any] = handler(self)
         return {
-            key: value for key, value in written.items() if value is not None or key not in keys
+            key: value
+            for key, value in written.items()
+            if key not in keys or value not in (None, (), [])
         }
 
     return model_serializer(mode="wrap")(write)

@@ -174,7 +174,7 @@ def _draw(
     flown = assessment.experiment
     shapes = flown_shapes(assessment.flight.recording, flown)
     ways, start = (flown.uplink, flown.downlink), link_start(flown) or 0.0
-    subject = Subject(assessment.flight, *ways, look or Look(), shapes, start)
+    subject = Subject(assessment.flight, *ways, look or Look(), shapes, start, flown.faults)
     pictures = draw_all(subject, PRINT_KINDS if figures else PAGE_KINDS)
     if figures:
         if (target := folder / "figures").is_symlink():

@@ -3,10 +3,12 @@
 """Figures show the delays of the link profile, and mark changes of the link and HOLD."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from cloudrc.config.faults import FaultConfig
 from cloudrc.config.profile import ChangeConfig, DirectionConfig
 from cloudrc.messages import GuardState
 from cloudrc.records import GuardChange, LinkChanged
@@ -52,3 +54,14 @@ def test_holds_are_marked():
     mark_events(axes, subject)
     (patch,) = axes.patches
     assert (patch.get_x(), patch.get_width()) == pytest.approx((2.0, 1.0))
+
+
+def test_faults_are_marked():
+    fault = FaultConfig(kind="partition", at_s=2.0, duration_s=0.5)
+    subject = replace(subject_of(), faults=(fault,))
+    assert "(partition, 2 to 2.5 s since the link came up)" in legend(subject)
+    axes = new_figure(2.0, 3.0).subplots()
+    mark_events(axes, subject)
+    (patch,) = axes.patches
+    # The link started one second before the mission.
+    assert (patch.get_x(), patch.get_width()) == pytest.approx((1.0, 0.5))

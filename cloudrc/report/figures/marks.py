@@ -60,11 +60,17 @@ class LinkSpan(NamedTuple):
     cause: str  # cause of the change; "" if the link started with this profile
 
 
+def came_up(subject: Subject) -> float:
+    """Return when the link came up, in seconds since the start of the flight."""
+    flight = subject.flight
+    sent = flight.recording["/telemetry"]["stamp_ns"]
+    return float(flight.seconds(sent[0])) if len(sent) else 0.0
+
+
 def parts(subject: Subject, *, uplink: bool) -> list[LinkSpan]:
     """List the profiles that were in force in one direction of the link, the earliest first."""
     recording, seconds = subject.flight.recording, subject.flight.seconds
-    sent, table = recording["/telemetry"]["stamp_ns"], recording["/link"]
-    start = float(seconds(sent[0])) if len(sent) else 0.0
+    start, table = came_up(subject), recording["/link"]
     origin, at_start = start - subject.link_start, subject.uplink if uplink else subject.downlink
     found = [LinkSpan(-inf, origin, at_start, "")]
     ours = select(table.columns, table["uplink"] == uplink)
@@ -108,16 +114,23 @@ def set_in_flight(subject: Subject) -> list[tuple[float, str]]:
 
 
 def legend(subject: Subject) -> str:
-    """Explain the marks in a flight's figures (HOLD, changes of the link); "" if none."""
+    """Explain the marks in a flight's figures (HOLD, faults, changes of the link); "" if none."""
     changes = [f"{cause}, at {begin:.1f} s" for begin, cause in set_in_flight(subject)]
     text = HELD if holds(subject.flight) else ""
+    if subject.faults:
+        spans = (f"{each.kind}, {each.at_s:g} to {each.end:g} s" for each in subject.faults)
+        text += f" Grey: injected faults ({'; '.join(spans)} since the link came up)."
     if changes:
         text += f" Vertical lines: the link was set in flight ({'; '.join(changes)})."
     return text
 
 
 def mark_events(axes: Axes, subject: Subject) -> None:
-    """Draw the marks: HOLD shaded, and a vertical line for each change of the link."""
+    """Draw the marks: HOLD and faults shaded, a vertical line for each change of the link."""
+    start = came_up(subject)
+    for fault in subject.faults:
+        span = start + fault.at_s, start + fault.end
+        axes.axvspan(*span, color=style.GREY, alpha=0.25, lw=0, zorder=0.4)
     for begin, end in map(subject.flight.seconds, np.reshape(holds(subject.flight), (-1, 2))):
         axes.axvspan(begin, end, color=style.VERMILION, alpha=0.15, lw=0, zorder=0.5)
     for instant, _ in set_in_flight(subject):

@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cloudrc.config.faults import FaultConfig
 from cloudrc.config.profile import DirectionConfig
 from cloudrc.geometry.shapes import Shapes
 from cloudrc.metrics.flight import Array, Flight
@@ -115,6 +116,7 @@ class Subject:
     look: Look = Look()
     shapes: Shapes = NOTHING  # of robot and scene
     link_start: float = 0.0  # where the time line of the link begins [s]
+    faults: tuple[FaultConfig, ...] = ()  # that the experiment injects
 
     @property
     def times(self) -> Array:

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Faults of an experiment: keys, hashes, and what they do to the link."""
+
+import pytest
+
+from cloudrc.config.load import load_experiment, load_link
+from cloudrc.config.resolved import dump, fingerprint
+from cloudrc.errors import BadInputError
+from cloudrc.messages import GuardState
+from cloudrc.runs.experiment import check_mode
+from cloudrc.runs.flight import fly_in_memory
+from tests.config.conftest import refused_line
+
+IDEAL, STEPS = "link.profile=ideal", "mission.steps.count=2"
+
+
+def faulty(*faults, settings=()):
+    texts = ", ".join(f"{{{fault}}}" for fault in faults)
+    return load_experiment("steps", [IDEAL, STEPS, f"faults=[{texts}]", *settings])
+
+
+def test_without_faults_nothing_changes_and_with_them_the_file_repeats_the_flight(tmp_path):
+    bare = load_experiment("steps")
+    assert "faults" not in dump(bare)
+    assert fingerprint(load_experiment("steps", ["faults=[]"])) == fingerprint(bare)
+    with_fault = faulty("kind: partition, at_s: 12, duration_s: 0.8")
+    assert fingerprint(with_fault) != fingerprint(faulty())
+    (tmp_path / "again.yaml").write_text(dump(with_fault))
+    assert load_experiment(tmp_path / "again.yaml") == with_fault
+
+
+def test_faults_are_on_the_time_line_of_their_direction():
+    found = faulty(
+        "kind: partition, at_s: 5, duration_s: 1, direction: uplink",
+        "kind: burst, at_s: 4, duration_s: 2, packets: 20, direction: downlink",
+        "kind: ramp, at_s: 3, duration_s: 1.05, delay_ms: 105, direction: downlink",
+        settings=["link.downlink.changes=[{at_s: 3.5, delay_ms: 50}]", "link.start_s=2"],
+    )
+    (cut,) = found.uplink.blackouts
+    assert (cut.start_s, cut.duration_s, found.uplink.changes) == (7.0, 1.0, ())
+    assert found.downlink.blackouts == ()
+    line = {round(each.at_s, 6): each for each in found.downlink.changes}
+    assert [*line] == sorted(line)
+    assert [round(line[t].delay_ms, 6) for t in (3.5, 5.0, 5.1, 6.0, 6.05)] == [50, 60, 70, 155, 50]
+    assert [getattr(line[t].loss, "bad_end", 0) for t in (5.9, 6.0, 8.0)] == [0, 0.05, 0]
+    assert found.link_values["uplink"]["blackouts"][0]["start_s"] == 7.0
+
+
+def test_a_partition_makes_the_robot_hold_while_it_lasts():
+    fault = "kind: partition, at_s: 4, duration_s: 0.8"
+    guard = fly_in_memory(faulty(fault)).flight.recording["/guard"]
+    held = guard["stamp_ns"][guard["state"] == GuardState.HOLD] * 1e-9
+    assert 4.0 < held[0] < 4.3
+
+
+@pytest.mark.parametrize(
+    ("fault", "setting", "said"),
+    [
+        ("kind: cut, at_s: 1, duration_s: 1", STEPS, "faults.0.kind"),
+        ("kind: burst, at_s: 1, duration_s: 1", STEPS, "burst needs packets"),
+        ("kind: ramp, at_s: 1, duration_s: 1, delay_ms: 9, packets: 2", STEPS, "has no packets"),
+        ("kind: partition, at_s: 1, duration_s: 1", "link.profile=handover", "goes round"),
+    ],
+)
+def test_what_is_impossible_is_refused_in_one_line(fault, setting, said):
+    round_ = ["link.start_s=random"] if "handover" in setting else []
+    assert said in refused_line("steps", setting, *round_, f"faults=[{{{fault}}}]")
+
+
+def test_a_cluster_names_the_command_that_injects(tmp_path):
+    found = faulty("kind: partition, at_s: 1, duration_s: 1")
+    with pytest.raises(BadInputError, match=r"faults: .*kubectl delete pod"):
+        check_mode(found, "cluster")
+    link, experiment = tmp_path / "link.yaml", tmp_path / "experiment.yaml"
+    link.write_text("profile: null\n")
+    experiment.write_text(dump(found))
+    with pytest.raises(BadInputError, match=r"experiment.yaml: faults: .*kubectl delete pod"):
+        load_link(link, experiment)
