@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
+from itertools import count
 from math import degrees, dist, inf, pi, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +26,7 @@ from cloudrc.cloud.operator import Operator
 from cloudrc.cloud.planar import Planar
 from cloudrc.config import schema
 from cloudrc.config.compute import compute_times
+from cloudrc.config.faults import CLOUD_KILLED, CLOUD_PAUSED, WORLD_PAUSED, acting
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.resolved import ResolvedExperiment, ResolvedGuard
 from cloudrc.config.robot import RobotFacts, facts, is_planar
@@ -48,7 +50,7 @@ from cloudrc.tunnel.end import Identity
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 
 if TYPE_CHECKING:
-    from cloudrc.drivers.virtual import Sink, VirtualRun
+    from cloudrc.drivers.virtual import Clock, Sink, VirtualRun
     from cloudrc.records import Record
     from cloudrc.teleop.store import Order
     from cloudrc.world.endpoint import WorldEndpoint
@@ -94,36 +96,55 @@ def assemble(
     and `compute` are those of `build_cloud`. `queue` makes the queue of the packets in
     flight on the links.
     """
+    from cloudrc.drivers.faults import disturbed, faulty_clock
     from cloudrc.drivers.virtual import CPU_CLOCK, Clock, VirtualRun
 
     own = Clock(round(experiment.cloud.clock_offset_s * 1e9), experiment.cloud.clock_drift_ppm)
+    own, faults = faulty_clock(own, experiment.faults), experiment.faults
     links, start_ns = build_links(experiment), phase_ns(experiment)
     passes = not any(link.corrupts for link in links)  # only bytes can be damaged
     clock_id = VIRTUAL_CLOCK if own == Clock() else CLOUD_CLOCK
     of_world = Identity(VIRTUAL_CLOCK, b"world".ljust(16), VIRTUAL_RING, passes)
-    of_cloud = Identity(clock_id, b"cloud".ljust(16), VIRTUAL_RING, passes)
     world = build_world(experiment, of_world, lambda: start_ns)
-    teleop = start_mission(experiment, own.at(start_ns))
-    cloud = build_cloud(
-        experiment,
-        of_cloud,
-        teleop,
-        lambda: own.at(start_ns),
-        cpu_clock=CPU_CLOCK,
-        make_loop=make_loop,
-        channel=channel,
-        compute=compute,
+    teleop = start_mission(experiment, own.at(start_ns), own)
+    starts = count(1)
+
+    def start_cloud(now_ns: int) -> CloudEndpoint:
+        number = next(starts)  # a new process has another nonce
+        nonce = b"cloud" if number == 1 else b"cloud %d" % number
+        return build_cloud(
+            experiment,
+            Identity(clock_id, nonce.ljust(16), VIRTUAL_RING, passes),
+            teleop,
+            lambda: now_ns,
+            cpu_clock=CPU_CLOCK,
+            make_loop=make_loop,
+            channel=channel,
+            compute=compute,
+        )
+
+    cloud = start_cloud(own.at(start_ns))
+    ends = (
+        disturbed(world, lambda now_ns: world, acting(faults, WORLD_PAUSED), Clock()),
+        disturbed(cloud, start_cloud, acting(faults, CLOUD_KILLED, CLOUD_PAUSED), own),
     )
     in_flight = queue(links) if queue else None
-    run = VirtualRun(world, cloud, *links, cloud_clock=own, in_flight=in_flight)
+    run = VirtualRun(*ends, *links, cloud_clock=own, in_flight=in_flight)
     return world, cloud, teleop, run
 
 
-def start_mission(experiment: ResolvedExperiment, now_ns: int = 0) -> Teleop:
-    """Make a teleop that flies the experiment's mission from `now_ns` [ns] on, cloud's clock."""
+def start_mission(
+    experiment: ResolvedExperiment, now_ns: int = 0, clock: Clock | None = None
+) -> Teleop:
+    """Make a teleop that flies the experiment's mission from `now_ns` [ns] on, cloud's clock.
+
+    `clock` is cloud's clock, by default virtual time.
+    """
+    from cloudrc.drivers.faults import teleop_of
+    from cloudrc.drivers.virtual import Clock
     from cloudrc.teleop.store import MissionRecord, Order
 
-    teleop = Teleop(steered_in(experiment.world))
+    teleop = teleop_of(steered_in(experiment.world), experiment.faults, clock or Clock())
     order = Order(build_plan(experiment), touch=experiment.mission.touch)
     teleop.start(now_ns, MissionRecord("m1", order, ONLY_MISSION))
     return teleop

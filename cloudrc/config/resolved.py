@@ -17,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from cloudrc.config.faults import refusal, with_faults
+from cloudrc.config.faults import OF_LINK, acting, refusal, with_faults
 from cloudrc.config.profile import DIRECTIONS, RANDOM, CloudTime, CommandAge, DirectionConfig
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, known_robot
 from cloudrc.config.scene import scene_of
@@ -150,7 +150,8 @@ class ResolvedExperiment(Experiment):
     def _refuse_faults(self) -> ResolvedExperiment:
         link = self.link
         goes_round = link.start_s == RANDOM
-        if text := refusal(self.faults, link.uplink, link.downlink, goes_round=goes_round):
+        ways, is_fleet = (link.uplink, link.downlink), self.is_fleet
+        if text := refusal(self.faults, *ways, goes_round=goes_round, is_fleet=is_fleet):
             raise ValueError(text)
         return self
 
@@ -169,7 +170,8 @@ class ResolvedExperiment(Experiment):
         way: DirectionConfig = getattr(self.link, name)
         if self.link.start_s == RANDOM:
             return way.model_copy(update={"loop": True}) if way.may_repeat else way
-        faults = [fault for fault in self.faults if fault.direction in ("both", name)]
+        link = acting(self.faults, *OF_LINK)
+        faults = [fault for fault in link if fault.direction in (None, name)]
         return with_faults(way, faults, self.link.start_s or 0.0) if faults else way
 
     @property
@@ -184,7 +186,7 @@ class ResolvedExperiment(Experiment):
     def link_values(self) -> dict[str, Any]:
         """Content of a profile of this link with its faults, without defaults."""
         link = self.link
-        if self.faults:
+        if acting(self.faults, *OF_LINK):
             link = link.model_copy(update={"uplink": self.uplink, "downlink": self.downlink})
         keys = {*DIRECTIONS, "start_s"}
         return link.model_dump(mode="json", include=keys, exclude_defaults=True)

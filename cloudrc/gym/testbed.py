@@ -152,19 +152,20 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         Args:
             experiment: Name of a shipped experiment, or path of a file.
             robot: Name of a shipped robot, or path; None: that of the experiment.
-            settings: Further changes, as with `--set`: key -> value. The link is always ideal.
+            settings: Further changes, as with `--set`: key -> value. The link is always ideal,
+                and nothing fails.
             render_mode: None; a flight is drawn by its report.
         """
         require("a robot of the testbed as an environment", SIM)
         for key in settings or {}:
-            if key in OWN or key.startswith("link"):
+            if key in OWN or key.startswith(("link", "faults")):
                 raise problem_at(key, "is the affair of Networked and the policy; leave it out")
         texts = {**(settings or {}), **OWN, **({"world.robot": robot} if robot else {})}
         self.render_mode = render_mode
         loaded = load(
             experiment, [f"{key}={json.dumps(value, default=str)}" for key, value in texts.items()]
         )
-        self.experiment = loaded.model_copy(update={"link": Link(profile="ideal")})
+        self.experiment = loaded.model_copy(update={"link": Link(profile="ideal"), "faults": ()})
         guard = self.experiment.guard
         axes = PLANE if is_planar(self.experiment.world.robot) else SPACE
         self._parts = (*axes, "yaw rate")

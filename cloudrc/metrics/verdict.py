@@ -215,12 +215,19 @@ def _too_slow(factor: float) -> str:
 
 
 def flight_evidence(
-    flight: Flight, numbers: Mapping[str, Number], *, real_time: bool, interrupted: bool
+    flight: Flight,
+    numbers: Mapping[str, Number],
+    *,
+    real_time: bool,
+    interrupted: bool,
+    kills: int = 0,
 ) -> Evidence:
     """Collect the evidence for the verdict from the records and from the metrics of a flight.
 
     `real_time` is True if the run had to keep real time: in all modes except virtual. `interrupted`
     is True if the run was stopped.
+
+    The sessions after the `kills` of cloud that the experiment has asked for are no failures.
     """
     recording, end_ns = flight.recording, flight.end_ns
     reached, touch = numbers.get("waypoints_reached"), None
@@ -235,19 +242,19 @@ def flight_evidence(
         end=UNKNOWN if end_ns is None else _moment(flight, end_ns),
         time_limit=flight.criteria.time_limit_s or inf,
         touch=touch,
-        violations=tuple(_violations(flight)),
+        violations=tuple(_violations(flight, kills)),
         slow=_not_real_time(numbers) if real_time else "",
         lost=describe(recording.holes, flight.seconds) or recording.note,
         unconfirmed=unconfirmed(flight),
     )
 
 
-def _violations(flight: Flight) -> Iterator[FlightFailure]:
+def _violations(flight: Flight, kills: int) -> Iterator[FlightFailure]:
     """Yield a failure for each recorded event that a successful flight must not have."""
     yield from _obstacles(flight)
     yield from _onboard_failures(flight)
     yield from _interventions(flight)
-    yield from _restarts(flight)
+    yield from _restarts(flight, kills)
     yield from plugin_failures(flight.recording, flight.span_ns)
     if flight.criteria.settle_m is not None:
         yield from _responses(flight, flight.criteria.settle_m)
@@ -308,12 +315,14 @@ def _onboard_failures(flight: Flight) -> Iterator[FlightFailure]:
             yield FlightFailure(code, text, *(_moment(flight, stamp_ns) if starts else UNKNOWN))
 
 
-def _restarts(flight: Flight) -> Iterator[FlightFailure]:
-    for stamp_ns, end, cause in rows_of(flight.during("/session"), "stamp_ns", "end", "cause"):
-        # The session that the mission itself opens may have the stamp of the start.
-        if end == "world" and stamp_ns > (flight.start_ns or 0):
-            text = f"world opened a new session in flight: {cause}"
-            yield FlightFailure("world_restarted", text, *_moment(flight, stamp_ns))
+def _restarts(flight: Flight, kills: int) -> Iterator[FlightFailure]:
+    """Yield a failure for each new session in flight, but for those after `kills` of cloud."""
+    opened = rows_of(flight.during("/session"), "stamp_ns", "end", "cause")
+    # The session that the mission itself opens may have the stamp of the start.
+    of_world = [row for row in opened if row[1] == "world" and row[0] > (flight.start_ns or 0)]
+    for stamp_ns, _, cause in of_world[kills:]:
+        text = f"world opened a new session in flight: {cause}"
+        yield FlightFailure("world_restarted", text, *_moment(flight, stamp_ns))
 
 
 def plugin_failures(

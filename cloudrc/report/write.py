@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cloudrc.config.faults import CLOUD_KILLED, acting
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.config.time_line import link_start
@@ -50,7 +51,11 @@ def assess(
     numbers, metric_notes, traceback = measure_all(flight, own)
     # A file that is cut short does not tell that the run was interrupted.
     evidence = flight_evidence(
-        flight, numbers, real_time=run.mode != "virtual", interrupted=run.interrupted
+        flight,
+        numbers,
+        real_time=run.mode != "virtual",
+        interrupted=run.interrupted,
+        kills=len(acting(experiment.faults, CLOUD_KILLED)),
     )
     verdict, operator = judge(evidence), None
     notes = list(run.notes)

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 from cloudrc.config import overrides
 from cloudrc.config.compute import check_unshared
-from cloudrc.config.faults import NOT_IN_CLUSTER
+from cloudrc.config.faults import refusal_in
 from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import OUTSIDE, Settings, naming_settings, parse_settings
 from cloudrc.config.problems import problem_at
@@ -102,8 +102,8 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
     """
     if mode == "cluster":
         check_alone(experiment)
-        if experiment.faults:
-            raise problem_at("faults", NOT_IN_CLUSTER)
+    if refused := refusal_in(mode, experiment.faults):
+        raise problem_at("faults", refused)
     if mode != "virtual" and (experiment.cloud.clock_offset_s or experiment.cloud.clock_drift_ppm):
         text = "acts, as clock_drift_ppm, in virtual time only; use --mode virtual, or leave it out"
         raise problem_at("cloud.clock_offset_s", text)

@@ -12,6 +12,7 @@ from cloudrc.runs.experiment import check_mode
 from cloudrc.runs.flight import fly_in_memory
 from tests.config.conftest import refused_line
 
+KILLED = "kind: cloud_killed, at_s: 4, duration_s: 0.8"
 IDEAL, STEPS = "link.profile=ideal", "mission.steps.count=2"
 
 
@@ -61,11 +62,24 @@ def test_a_partition_makes_the_robot_hold_while_it_lasts():
         ("kind: burst, at_s: 1, duration_s: 1", STEPS, "burst needs packets"),
         ("kind: ramp, at_s: 1, duration_s: 1, delay_ms: 9, packets: 2", STEPS, "has no packets"),
         ("kind: partition, at_s: 1, duration_s: 1", "link.profile=handover", "goes round"),
+        ("kind: cloud_killed, at_s: 1", STEPS, "cloud_killed needs duration_s"),
+        ("kind: clock_step, at_s: 1, step_s: -1", STEPS, "faults.0.step_s"),
+        ("kind: clock_step, at_s: 1, step_s: 1, duration_s: 1", STEPS, "has no duration_s"),
+        ("kind: world_paused, at_s: 1, duration_s: 1, direction: uplink", STEPS, "no direction"),
+        ("kind: cloud_paused, at_s: 1, duration_s: 1", "fleet.robots=2", "a fleet can only"),
+        (f"{KILLED}}}, {{kind: cloud_paused, at_s: 4.5, duration_s: 1", STEPS, "cloud overlap"),
     ],
 )
 def test_what_is_impossible_is_refused_in_one_line(fault, setting, said):
     round_ = ["link.start_s=random"] if "handover" in setting else []
     assert said in refused_line("steps", setting, *round_, f"faults=[{{{fault}}}]")
+
+
+@pytest.mark.parametrize("fault", [KILLED, "kind: clock_step, at_s: 1, step_s: 1"])
+def test_what_real_time_cannot_inject_is_refused_with_the_key(fault):
+    check_mode(faulty(fault), "virtual")
+    with pytest.raises(BadInputError, match=r"faults: c.* acts in virtual time only"):
+        check_mode(faulty(fault), "local")
 
 
 def test_a_cluster_names_the_command_that_injects(tmp_path):

@@ -39,7 +39,7 @@ from cloudrc.world.robot import Robot
 from tests.faults.adversary import DishonestLoop, HostileOperator, Lie, dishonesty
 from tests.faults.inject import BUGS, SECRET, bugs, inject, shaped
 from tests.faults.invariants import FlightSteps, check_order
-from tests.faults.models import RestartableEndpoint, TeleopModel
+from tests.faults.models import FaultyEndpoint, TeleopModel, TwoClouds
 from tests.faults.observer import RobotObserver
 from tests.faults.rules import Breach, Rules
 from tests.faults.schedule import OFFSET_MAX, Schedule, generator
@@ -51,7 +51,7 @@ class FaultRun:
     """One flight of world, cloud, teleop and link.
 
     `secrets` maps "world" and "cloud" to the keys in their key files; `rings` maps them to the keys
-    that their running processes use.
+    that their running processes use. `others` are the records of a second cloud.
     """
 
     def __init__(
@@ -88,12 +88,13 @@ class FaultRun:
         self.secrets, self.rings = {"world": SECRET, "cloud": SECRET}, dict[str, KeyRing]()
         self.generations = {"world": 0, "cloud": 0}
         self.of_world, self.of_cloud = list[Record](), list[Record]()
+        self.others = list[Record]()
         phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))
         self.teleop = TeleopModel(self._fence, phase_ns)
         if start:
             self.teleop.order(self.make_order(), self._clock.at(0))
-        self.world = RestartableEndpoint(self._build_world, Clock())
-        self.cloud = RestartableEndpoint(self._build_cloud, self._clock)
+        self.world = FaultyEndpoint(self._build_world, Clock())
+        self.cloud = FaultyEndpoint(self._build_cloud, self._clock)
         self.teleop.run_on(self.cloud)
         self._connect()
         inject(self)
@@ -148,8 +149,13 @@ class FaultRun:
 
     def end_rival(self) -> None:
         """Stop the second cloud, so that the first cloud can control the robot again."""
-        self.cloud.members = self.cloud.members[:1]
+        self.end_cloud(1)
         self._rival_at = None
+
+    def end_cloud(self, number: int) -> None:
+        """Stop the first cloud (0) or the second one (1), if both run."""
+        if isinstance(self.cloud.inner, TwoClouds):
+            del self.cloud.inner.members[number : number + 1]
 
     def sha256(self) -> str:
         """Return the hash of all records so far."""
@@ -191,13 +197,13 @@ class FaultRun:
             return GuardState.GROUND, "the world is down"
         return self.robot.guard.state, self.robot.guard.cause.words
 
-    def _build_world(self, start_ns: int) -> list[Endpoint]:
+    def _build_world(self, start_ns: int) -> Endpoint:
         identity = self._begin("world", assembly.VIRTUAL_CLOCK)
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self._observers.append(RobotObserver(world.robot, self._rules, start_ns))
-        return [world]
+        return world
 
-    def _build_cloud(self, start_ns: int) -> list[Endpoint]:
+    def _build_cloud(self, start_ns: int) -> Endpoint:
         identity = self._begin("cloud", self._clock_id)
         teleop: Operator = self.teleop.join(start_ns)
         if self._words is not None:
@@ -207,9 +213,9 @@ class FaultRun:
             self.experiment, identity, teleop, lambda: start_ns, make_loop=make_loop
         )
         if self._rival_at is None:
-            return [cloud]
+            return cloud
         joins_ns = max(self._clock.at(round(self._rival_at * 1e9)), start_ns)
-        return [cloud, self._build_rival(joins_ns)]
+        return TwoClouds([cloud, self._build_rival(joins_ns)], self.others)
 
     def _build_rival(self, start_ns: int) -> CloudEndpoint:
         """Build a second cloud with the same key; it has its own teleop and the same mission."""

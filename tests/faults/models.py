@@ -4,88 +4,45 @@
 
 from __future__ import annotations
 
-from bisect import insort
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from operator import itemgetter
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
+from cloudrc.drivers.faults import RestartableEndpoint
 from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop, TeleopLoop, UnixPeer
 from cloudrc.drivers.virtual import Clock
 from cloudrc.endpoint import Endpoint
 from cloudrc.geometry.fence import Fence
-from cloudrc.messages import NEVER_NS
+from cloudrc.messages import NEVER_NS, Datagram
 from cloudrc.records import Fault, MissionEvent, Record
 from cloudrc.teleop.refusals import ConflictError, UnavailableError
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import MissionRecord, MissionStore, Order, connect
 from cloudrc.teleop.wire import ALARM, Message
 
-FAR_NS = 1 << 62
 CFS_PERIOD = 0.1  # period of the kernel's CPU quota [s]
-SOCKET_MAX = 256
-"""Number of datagrams that the socket of a frozen process can hold: Linux' default buffer."""
 UNIX_SOCKET_MAX = 11
 """Number of datagrams that a Unix socket can hold: net.unix.max_dgram_qlen, which is 10, plus 1."""
 
-Action: TypeAlias = Callable[..., None]
-"""Function that begins or ends a fault."""
 Tamper: TypeAlias = Callable[[bytes, int], list[bytes]]
 """Function that replaces an arriving datagram by others, at a virtual time [ns]."""
 Call: TypeAlias = Callable[[MissionService, int], object]
 """Function that calls teleop's API; takes the service and the time on teleop's clock [ns]."""
 
 
-class RestartableEndpoint:
-    """An `Endpoint`: world or cloud in a process that a scenario can kill, freeze and start.
+class FaultyEndpoint(RestartableEndpoint):
+    """World or cloud in a process whose datagrams may change, and which may be throttled."""
 
-    A second cloud runs in the process of the first one; each of them receives all datagrams.
-
-    Attributes:
-        now_ns: Virtual time of the last event [ns].
-        members: World, the cloud, or both clouds; empty while there is no process.
-        others: Records of the second cloud, oldest first.
-    """
-
-    def __init__(self, build: Callable[[int], list[Endpoint]], clock: Clock) -> None:
-        """Start a process; `build` makes its members, given the time on `clock` [ns]."""
-        self._build, self.clock, self.now_ns = build, clock, 0
+    def __init__(self, build: Callable[[int], Endpoint], clock: Clock) -> None:
+        """Start a process; `build` makes its endpoint, given the time on `clock` [ns]."""
         self.tamper: Tamper | None = None  # changes the datagrams that arrive
-        self._frozen_until_ns = -1
-        self._waiting: list[bytes] = []
-        self._left: list[Record] = []
-        self._actions = list[tuple[int, Action, tuple[Any, ...]]]()
-        self.members, self.others = list[Endpoint](), list[Record]()
-        self.start()
-
-    @property
-    def inner(self) -> Endpoint | None:
-        """World or the first cloud; None while there is no process."""
-        return self.members[0] if self.members else None
-
-    def at(self, seconds: float, action: Action, *args: Any) -> None:
-        """Schedule an action with `args` at the virtual time `seconds` [s]."""
-        insort(self._actions, (round(seconds * 1e9), action, args), key=itemgetter(0))
-
-    def kill(self) -> None:
-        """Kill the process as with SIGKILL; its records so far are kept."""
-        self._left = self.take_records()
-        self.members, self._waiting, self._frozen_until_ns = [], [], -1
-
-    def start(self) -> None:
-        """Start a new process of world or cloud."""
-        self.members = self._build(self.clock.at(self.now_ns))
+        super().__init__(build(clock.at(0)), build, clock)
 
     def restart(self, down: float) -> None:
         """Kill the process; start a new one after `down` [s]."""
         self.kill()
         self.at(self.now_ns * 1e-9 + down, self.start)
-
-    def freeze(self, duration: float) -> None:
-        """Stop the process as with SIGSTOP for `duration` [s]."""
-        until_ns = self.now_ns + round(duration * 1e9)
-        self._frozen_until_ns = max(self._frozen_until_ns, until_ns)
 
     def throttle(self, start: float, duration: float, share: float) -> None:
         """Throttle the process: it runs for a `share` [1] of each CFS period, then it is stopped.
@@ -96,57 +53,47 @@ class RestartableEndpoint:
         for n in range(int(duration / CFS_PERIOD)):
             self.at(start + n * CFS_PERIOD, self.freeze, stall)
 
-    def receive_now(self, data: bytes, now_ns: int) -> None:
-        """Pass a datagram to the process unchanged; keep it while the process is frozen."""
-        if self._frozen_until_ns <= now_ns:
-            for member in self.members:
-                member.receive_datagram(data, self.clock.at(now_ns))
-        elif self.members and len(self._waiting) < SOCKET_MAX:
-            self._waiting.append(data)
-
-    def receive_datagram(self, data: bytes, now_ns: int) -> None:
+    def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Receive a datagram at `now_ns` [ns]; `tamper`, if set, changes the datagram first."""
         for each in [data] if self.tamper is None else self.tamper(data, now_ns):
-            self.receive_now(each, now_ns)
+            self.pass_on(each, now_ns)
+
+
+class TwoClouds:
+    """An `Endpoint`: two clouds in one process; each of them receives all datagrams.
+
+    Attributes:
+        members: The clouds, the first one first.
+    """
+
+    def __init__(self, members: list[Endpoint], others: list[Record]) -> None:
+        """Run `members`; the records of all but the first are appended to `others`."""
+        self.members, self._others = members, others
+
+    def receive_datagram(self, data: Datagram, now_ns: int) -> None:
+        """Implement `Endpoint.receive_datagram`."""
+        for member in self.members:
+            member.receive_datagram(data, now_ns)
 
     def next_deadline_ns(self) -> int:
         """Implement `Endpoint.next_deadline_ns`."""
-        due_ns = self._actions[0][0] if self._actions else FAR_NS
-        if self.members and self._frozen_until_ns >= 0:
-            return min(due_ns, self._frozen_until_ns)
-        wakes_ns = [self.clock.when(member.next_deadline_ns()) for member in self.members]
-        return min([due_ns, *wakes_ns])
+        return min(member.next_deadline_ns() for member in self.members)
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Implement `Endpoint.handle_deadline`: inject due faults, then run the process."""
-        self.now_ns = now_ns
-        while self._actions and self._actions[0][0] <= now_ns:
-            _, act, args = self._actions.pop(0)
-            act(*args)
-        if 0 <= self._frozen_until_ns <= now_ns:
-            self._frozen_until_ns = -1
-            waiting, self._waiting = self._waiting, []
-            for data in waiting:
-                self.receive_now(data, now_ns)
-        own_ns = self.clock.at(now_ns)
-        for member in self.members if self._frozen_until_ns < 0 else ():
-            if own_ns >= member.next_deadline_ns():
-                member.handle_deadline(own_ns)
+        """Implement `Endpoint.handle_deadline`."""
+        for member in self.members:
+            if now_ns >= member.next_deadline_ns():
+                member.handle_deadline(now_ns)
 
-    def take_datagrams(self) -> list[bytes]:
-        """Return the datagrams of the process; none while it is frozen or does not run."""
-        if self._frozen_until_ns >= 0:
-            return []
+    def take_datagrams(self) -> list[Datagram]:
+        """Return the datagrams of both."""
         return [data for member in self.members for data in member.take_datagrams()]
 
     def take_records(self) -> list[Record]:
-        """Return and remove the records since the last call, also those of a killed process.
-
-        The records of a second cloud go to `others`.
-        """
-        records, self._left = self._left, []
-        for n, member in enumerate(self.members):
-            (self.others if n else records).extend(member.take_records())
+        """Return the records of the first cloud; those of another one go to `others`."""
+        records, *others = [member.take_records() for member in self.members]
+        for each in others:
+            self._others += each
         return records
 
 
@@ -179,7 +126,7 @@ class TeleopModel:
         events: Events of all missions, oldest first.
     """
 
-    _host: RestartableEndpoint  # the machine of cloud, from `run_on` on
+    _host: FaultyEndpoint  # the machine of cloud, from `run_on` on
 
     def __init__(self, fence: Fence, phase_ns: int) -> None:
         """Start teleop.
@@ -218,7 +165,7 @@ class TeleopModel:
         """Kill the process; only the disk remains."""
         self.service = None
 
-    def run_on(self, host: RestartableEndpoint) -> None:
+    def run_on(self, host: FaultyEndpoint) -> None:
         """Run teleop on the machine of the cloud `host`; teleop also runs while cloud is down."""
         self._host = host
         host.at(self._phase_ns * 1e-9, self._wake)

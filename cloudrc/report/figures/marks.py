@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
+from cloudrc.config.faults import FaultConfig
 from cloudrc.config.profile import DirectionConfig
 from cloudrc.errors import CloudrcError
 from cloudrc.link.profile import Timeline
@@ -118,11 +119,16 @@ def legend(subject: Subject) -> str:
     changes = [f"{cause}, at {begin:.1f} s" for begin, cause in set_in_flight(subject)]
     text = HELD if holds(subject.flight) else ""
     if subject.faults:
-        spans = (f"{each.kind}, {each.at_s:g} to {each.end:g} s" for each in subject.faults)
+        spans = map(_span, subject.faults)
         text += f" Grey: injected faults ({'; '.join(spans)} since the link came up)."
     if changes:
         text += f" Vertical lines: the link was set in flight ({'; '.join(changes)})."
     return text
+
+
+def _span(fault: FaultConfig) -> str:
+    until = f" to {fault.end:g}" if fault.length else ""
+    return f"{fault.kind}, {fault.at_s:g}{until} s"
 
 
 def mark_events(axes: Axes, subject: Subject) -> None:
@@ -130,7 +136,8 @@ def mark_events(axes: Axes, subject: Subject) -> None:
     start = came_up(subject)
     for fault in subject.faults:
         span = start + fault.at_s, start + fault.end
-        axes.axvspan(*span, color=style.GREY, alpha=0.25, lw=0, zorder=0.4)
+        edge = 0.0 if fault.length else 1.2  # a step of a clock is a line
+        axes.axvspan(*span, color=style.GREY, alpha=0.25, lw=edge, zorder=0.4)
     for begin, end in map(subject.flight.seconds, np.reshape(holds(subject.flight), (-1, 2))):
         axes.axvspan(begin, end, color=style.VERMILION, alpha=0.15, lw=0, zorder=0.5)
     for instant, _ in set_in_flight(subject):
