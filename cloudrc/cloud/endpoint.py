@@ -451,5 +451,6 @@ class CloudEndpoint(TunnelEnd):
         self._control = control
 
     def _record_counts(self, now_ns: int) -> None:
+        self.count_sent()
         for name, count in sorted(self.counts.items()):
             self._records.append(Counted(now_ns, "cloud", name, count))

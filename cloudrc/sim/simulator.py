@@ -8,7 +8,9 @@ quarter of the time of a numpy slice assignment.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import pairwise
 from math import dist
 from struct import Struct
 from typing import Any
@@ -42,6 +44,18 @@ _pack_applied = Struct("6d").pack_into
 _unpack_pose, _unpack_twist = Struct("7d").unpack_from, Struct("6d").unpack_from
 _new = tuple.__new__
 _readings_of = Readings.of  # looking up a class method binds it anew each time
+
+
+def sensor_reader(
+    values: memoryview[float], addresses: Sequence[int]
+) -> Callable[[], tuple[float, ...]]:
+    """Return a function that reads the present `values` at some addresses, in their order."""
+    if sorted({*addresses}) != [*addresses]:
+        return lambda: tuple(map(values.__getitem__, addresses))
+    # The order of MuJoCo, as usual: to unpack all at once takes less time than one by one.
+    gaps = (here - before - 1 for before, here in pairwise([-1, *addresses]))
+    layout = "".join(f"{values.itemsize * gap}xd" for gap in gaps)
+    return partial(Struct(layout).unpack_from, values.cast("B"))
 
 
 class Simulator:
@@ -98,7 +112,8 @@ class Simulator:
         self._ctrl, self._applied = memoryview(data.ctrl), memoryview(data.qfrc_applied)
         self._sensordata: memoryview[float] = memoryview(data.sensordata)
         self.sensors = tuple(sensors)
-        self._addresses = [each.address for each in sensors]
+        addresses = [each.address for each in sensors]
+        self._read_sensors = sensor_reader(self._sensordata, addresses)
         self._probe = -1 if probe is None else find_part(model, "site", probe, "probe")
         self._force_address = _find_force(model, self._probe)
         of_force = (each for each in sensors if each.address == self._force_address)
@@ -194,7 +209,7 @@ class Simulator:
 
     def read_sensors(self) -> tuple[float, ...]:
         """Return what the robot's own sensors show, each in its unit, in the order of `sensors`."""
-        return tuple(map(self._sensordata.__getitem__, self._addresses))
+        return self._read_sensors()
 
     def bad_values(self) -> int:
         """Return how many positions, velocities, accelerations and controls were not finite.

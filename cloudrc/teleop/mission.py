@@ -197,16 +197,17 @@ class MissionFlight:
     def handle_deadline(self, now_ns: int) -> None:
         """Check the time limits, and move the setpoint along a track."""
         limit = self.plan.time_limit
-        if self.state in UNDER_WAY and self.elapsed(now_ns) >= limit:
+        if (now_ns - self._began_ns) * 1e-9 >= limit and self.state in UNDER_WAY:
             text = f"mission not done within {limit:g} s (time_limit_s): {self.route.where}"
             if self.state == STARTING:
                 text = f"the robot has not started within {limit:g} s (time_limit_s)"
                 text += "; is the link up?"
             self.end(now_ns, "timed_out", text)
-        elif self.state == FLYING and (text := self.route.timeout()):
-            self.end(now_ns, "leg_timed_out", text)
-        if self.state == FLYING and self.plan.track:
-            self._aim.follow(self._began_ns, now_ns)
+        elif self.state == FLYING:
+            if text := self.route.timeout():
+                self.end(now_ns, "leg_timed_out", text)
+            elif self.plan.track:
+                self._aim.follow(self._began_ns, now_ns)
         if NEVER_NS < self._released_ns <= now_ns and self._is_driven:
             self._released_ns = NEVER_NS
             text = f"no request to drive for {HEARTBEAT_NS * 1e-9:g} s: the robot brakes and holds"

@@ -77,13 +77,16 @@ class Route:
         A robot that follows a carrot only has to be there when the carrot leaves.
         """
         leg = self.plan.legs[self.leg]
-        rested = self._has_rested(leg, seen, now_ns)
+        is_there = leg.has(seen)
+        rested = self._has_rested(leg, seen, now_ns, is_there=is_there)
         if not leg.speed:
             return rested
+        if not is_there:
+            return False
         leaves_ns = self._aim.leaves_ns(self.leg)
-        return leg.has(seen) and leaves_ns is not None and now_ns >= leaves_ns
+        return leaves_ns is not None and now_ns >= leaves_ns
 
-    def _has_rested(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
+    def _has_rested(self, leg: Leg, seen: RobotStatus, now_ns: int, *, is_there: bool) -> bool:
         before_ns, self._seen_ns = self._seen_ns, now_ns
         if seen.guard is HOLD:
             self._near_since_ns = NEVER_NS
@@ -93,7 +96,7 @@ class Route:
                 self._flown_ns += min(now_ns - before_ns, GAP_MAX_NS)
             if now_ns - before_ns > UNSEEN_MAX_NS:
                 self._near_since_ns = NEVER_NS  # the robot's path in the gap is unknown
-        if not leg.has(seen):
+        if not is_there:
             self._near_since_ns = NEVER_NS
             return False
         if self._near_since_ns < 0:

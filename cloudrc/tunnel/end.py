@@ -33,7 +33,7 @@ class TunnelEnd:
 
     Attributes:
         counts: Name of an event -> how often the event has happened. The robot's guard or the
-            control loop counts its events here, too.
+            control loop counts its events here, too. `count_sent` brings "sent" up to date.
     """
 
     def __init__(
@@ -47,6 +47,7 @@ class TunnelEnd:
         self._clock_is_shared = False
         self._datagrams: list[Datagram] = []
         self._records: list[Record] = []
+        self._sent = self._sent_bytes = 0  # datagrams that `counts` lacks, and their bytes
 
     @property
     def epoch(self) -> int:
@@ -94,6 +95,12 @@ class TunnelEnd:
 
     def _queue(self, datagram: Datagram) -> None:
         self._datagrams.append(datagram)
-        self.counts["sent"] += 1
-        is_passed = type(datagram) is Passed
-        self.counts["sent_bytes"] += datagram.size if is_passed else len(datagram)
+        self._sent += 1
+        self._sent_bytes += datagram.size if type(datagram) is Passed else len(datagram)
+
+    def count_sent(self) -> None:
+        """Add what was sent since the last call to `counts`; for each datagram takes longer."""
+        if self._sent:
+            self.counts["sent"] += self._sent
+            self.counts["sent_bytes"] += self._sent_bytes
+            self._sent = self._sent_bytes = 0

@@ -270,6 +270,7 @@ class WorldEndpoint(TunnelEnd):
         """Record the counters of world and guard; report a slow simulation once per session."""
         before_ns = self._counted_slip_ns
         self._count_ns, self._counted_slip_ns = self._count_ns + COUNT_PERIOD_NS, self._slip_ns
+        self.count_sent()
         for name, count in sorted(self.counts.items()):
             self._records.append(Counted(now_ns, "world", name, count))
         lost_ns = self._slip_ns - (before_ns or 0)

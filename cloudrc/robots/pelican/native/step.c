@@ -53,6 +53,7 @@ typedef struct {
   double time_step, robot_radius, acceleration_max;
   i64 step_ns, check_steps, obstacle_count;
   /* State, which Python reads and writes between two runs. */
+  i64 now_ns, until_ns; /* time of the next step, and end of the run */
   double reference[3], wanted[3];
   i64 track_until_ns;
   double force_peak, impulse;
@@ -223,18 +224,18 @@ static void step_physics(StepState *f, const Readings *r) {
   f->free_steps += f->free_steps < 0 ? 1 : f->free_steps > 0 ? -1 : 0;
 }
 
-/* Run steps from now_ns up to until_ns [ns]; return their number. The run ends early before a step
-   that Python has to do, and after a step with new contacts. */
-i64 cloudrc_run(StepState *f, i64 now_ns, i64 until_ns) {
+/* Run steps from now_ns up to until_ns [ns]; return their number, and move now_ns on. The run ends
+   early before a step that Python has to do, and after a step with new contacts. */
+i64 cloudrc_run(StepState *f) {
   i64 steps = 0;
   double (*timer)(void) = *f->timer;
   *f->timer = 0;
   f->is_news = 0;
-  for (; now_ns < until_ns && !f->is_news; now_ns += f->step_ns) {
+  for (; f->now_ns < f->until_ns && !f->is_news; f->now_ns += f->step_ns) {
     Readings r;
     double commands[4];
     read(f, &r);
-    if (!guard_step(f, &r, now_ns)) break;
+    if (!guard_step(f, &r, f->now_ns)) break;
     for (int i = 0; i < 7; i++) f->before[i] = r.pose[i];
     for (int i = 0; i < 6; i++) f->before[7 + i] = r.twist[i];
     update(f, &r, commands);
