@@ -127,21 +127,31 @@ def least_clearance(
     """
     if not len(at) or not obstacles:
         return np.inf
-    reach = np.linalg.norm(points.positions, axis=1).max()
+    reach = np.linalg.norm(points.positions, axis=1)
     turned = np.linalg.norm(np.diff(facing, axis=0), axis=1)
-    moved = np.linalg.norm(np.diff(at, axis=0), axis=1) + 2 * reach * turned
+    moved = np.linalg.norm(np.diff(at, axis=0), axis=1) + 2 * reach.max() * turned
     path = np.concatenate(([0.0], np.cumsum(moved)))
-    found = np.full(len(at), np.inf)
+    # Distance of each pose from each obstacle, shape (m, n). At first a lower bound: no point is
+    # nearer than the base by more than its distance from the base and its radius. Where the bound
+    # is below the smallest clearance found so far, the distance of all points replaces it.
+    least = np.stack([each.distance(at) for each in obstacles]) - (reach + points.radii).max()
+    first = least.min(axis=0).argmin()
+    nearest = clearance(obstacles, at[[first]], facing[[first]], points)[0]
+    found = np.empty(len(at))
     new = np.unique(np.append(np.arange(0, len(at), _STRIDE), len(at) - 1))
     starts, ends = new[:-1], new[1:]
     while len(new):
-        found[new] = clearance(obstacles, at[new], facing[new], points)
+        for each, known in zip(obstacles, least, strict=True):
+            near = new[known[new] <= nearest + _ROUNDING]
+            known[near] = clearance([each], at[near], facing[near], points)
+            nearest = min(nearest, known[near].min(initial=np.inf))
+        found[new] = least[:, new].min(axis=0)
         bound = (found[starts] + found[ends] - (path[ends] - path[starts])) / 2
-        open_ = (ends - starts > 1) & (bound <= found.min() + _ROUNDING)
+        open_ = (ends - starts > 1) & (bound <= nearest + _ROUNDING)
         starts, ends = starts[open_], ends[open_]
         new = (starts + ends) // 2
         starts, ends = np.concatenate((starts, new)), np.concatenate((new, ends))
-    return float(found.min())
+    return float(nearest)
 
 
 def inside_tube(scene: Scene, positions: Array) -> NDArray[np.bool_]:
