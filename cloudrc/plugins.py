@@ -13,7 +13,6 @@ places:
 
 from __future__ import annotations
 
-import ast
 import importlib
 import inspect
 import pkgutil
@@ -128,8 +127,7 @@ def describe(kind: str, name: str) -> str:
     """
     module = _own_module(kind, name)
     if module and (spec := find_spec(module)) is not None and spec.origin is not None:
-        tree = ast.parse(Path(spec.origin).read_text("utf-8"))
-        return (ast.get_docstring(tree) or "").partition("\n")[0]
+        return Path(spec.origin).read_text("utf-8").split('"""', 2)[1].partition("\n")[0]
     try:
         return find(kind, name).doc
     except CloudrcError as error:

@@ -60,18 +60,25 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
 
     Unprintable characters are escaped. Columns with an index in `right` are aligned to the right.
     """
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
+    columns = []
+    for index, column in enumerate(zip(*rows, strict=True)):
+        shown = [escape(cell).rstrip() if index in right else escape(cell) for cell in column]
+        width = max(map(_width, shown))
+        blanks = [" " * (width - _width(cell)) for cell in shown]
+        pairs = (
+            zip(blanks, shown, strict=True) if index in right else zip(shown, blanks, strict=True)
+        )
+        columns.append([first + second for first, second in pairs])
+    return "\n".join("  ".join(line).rstrip() for line in zip(*columns, strict=True))
 
-    grid = Table.grid(padding=(0, 2, 0, 0))
-    for i in range(len(rows[0]) if rows else 0):
-        grid.add_column(justify="right" if i in right else "left")
-    for row in rows:
-        grid.add_row(*(Text(escape(cell)) for cell in row))
-    drawn = io.StringIO()
-    Console(file=drawn, width=10_000).print(grid)  # no line is wrapped
-    return "\n".join(line.rstrip() for line in drawn.getvalue().splitlines())
+
+def _width(cell: str) -> int:
+    """Return how many columns of a terminal a text takes."""
+    if cell.isascii():
+        return len(cell)
+    from rich.cells import cell_len
+
+    return cell_len(cell)
 
 
 def list_some(texts: Sequence[str], most: int = 3) -> str:

@@ -4,13 +4,23 @@
 
 import csv
 
-from cloudrc.text import cells, csv_table, latex_table
+from cloudrc.text import cells, csv_table, latex_table, table
 
 ROWS = [
     ("round trip", "95 %", "x_y", "note"),
     ("no network", "83-100 %", "-1.2 .. -3", "a & b"),
     ("time-indexed", "0-17 %", "-", "{}#$"),
 ]
+
+
+def test_a_table_has_columns_in_line_also_with_wide_characters_and_escapes_those_that_move():
+    rows = [("name", "n", "note"), ("東京", "12", ""), ("a\x1b", "3 ", "été")]
+    assert table(rows, right=[1]).split("\n") == [
+        "name    n  note",
+        "東京   12",
+        r"a\x1b   3  été",
+    ]
+    assert table([]) == ""
 
 
 def test_a_table_of_latex_has_minus_signs_and_no_bare_special_character():
