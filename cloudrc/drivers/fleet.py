@@ -104,7 +104,7 @@ class SharedCores:
         self._now_ns = now_ns
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)  # no two robots are the same
 class Member:
     """A robot of a fleet."""
 
