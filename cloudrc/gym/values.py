@@ -15,9 +15,16 @@ from gymnasium import spaces
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import RESULT, InvalidValueError, shorten, to_arrays
 
+_UNCHANGING = {bool, int, float, str, np.int64, np.float32, np.float64}
+"""Types of values that are their own copies."""
+
 
 def copied(value: Any) -> Any:
     """Return a copy that no one else changes."""
+    if type(value) is np.ndarray and not value.dtype.hasobject:  # the usual case: save time
+        return value.copy("K")
+    if type(value) in _UNCHANGING:
+        return value
     if type(value) is dict:
         return {key: copied(each) for key, each in value.items()}
     if type(value) is tuple:
@@ -77,11 +84,12 @@ def checker(space: spaces.Space[Any], what: str) -> Callable[[Any], None]:
 
 # A function of this module and no closure: an environment that has it can be pickled.
 def _check(space: spaces.Space[Any], what: str, action: Any) -> None:
-    with naming("the action", f"{what}, in {space}"):
-        try:
-            _judge(space, action)
-        except (TypeError, ValueError) as error:
-            why = f" ({error})" * bool(str(error))
+    try:
+        _judge(space, action)
+    except (TypeError, ValueError) as error:
+        why = f" ({error})" * bool(str(error))
+        # Only here: the text of a space takes longer than a step of many an environment.
+        with naming("the action", f"{what}, in {space}"):
             raise InvalidValueError(f"it is {shorten(action)}{why}") from None
 
 

@@ -91,7 +91,7 @@ class Quantity:
             found = np.asarray(found)
         except ValueError:  # rows of unequal lengths
             self.of(values, name)
-        if found.size and not self._contains(found.min()) & self._contains(found.max()):
+        if found.size and not self._spans(found.min().item(), found.max().item()):
             place = np.argwhere(~self._contains(found))[0].tolist()
             self.of(found[tuple(place)].item(), _at(place, name))
         return found
@@ -113,8 +113,12 @@ class Quantity:
             return values
         return [self._numbers(each, (*place, n), name) for n, each in enumerate(values)]
 
+    def _spans(self, low: float, high: float) -> bool:
+        """Return whether all numbers from `low` to `high` are in the range and finite."""
+        return self.ge <= low and high <= self.le and low > self.gt and -inf < low and high < inf
+
     def _contains(self, numbers: Any) -> Any:
-        """Return whether a number, or each of an array, is in the range and finite."""
+        """Return for each number of an array whether it is in the range and finite."""
         return (
             (numbers >= self.ge)
             & (numbers <= self.le)

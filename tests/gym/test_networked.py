@@ -17,6 +17,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.gym import Networked, NetworkedVector
 from cloudrc.gym.doubts import LinkWarning
 from cloudrc.gym.linear import Linear
+from cloudrc.gym.values import copied
 from tests.gym.envs import Counter, Mixed, both_ways, told
 from tests.support.programs import loaded
 from tests.tensors import KINDS, Tensor
@@ -274,6 +275,37 @@ def test_only_an_action_of_the_space_reaches_the_world(chunk, action):
     with pytest.raises(BadInputError, match=r"^[^\n]*the action: it is[^\n]*$"):
         env.step(action)
     assert env.unwrapped.executed == []
+
+
+class Told(spaces.Box):
+    """A space that counts how often its text is made."""
+
+    texts = 0
+
+    def __repr__(self):
+        self.texts += 1
+        return super().__repr__()
+
+
+def test_the_text_of_a_space_which_takes_long_is_made_only_for_an_error():
+    space = Told(-1, 1, (1,))
+    env = Networked(Counter(space))
+    env.reset()
+    before = space.texts
+    env.step(np.zeros(1))
+    assert space.texts == before
+    with pytest.raises(BadInputError, match=r"give one action, in Box\(-1"):
+        env.step(np.zeros(2))
+
+
+@pytest.mark.parametrize("kind", [np.float32, object])
+def test_what_world_and_policy_keep_is_not_what_the_other_changes(kind):
+    numbers = np.array([1.0, 2.0], kind)
+    kept = copied({"a": numbers, "b": (numbers, "text", np.float32(3.0))})
+    numbers[:] = 9.0
+    assert [*map(list, (kept["a"], kept["b"][0]))] == [[1.0, 2.0]] * 2
+    assert kept["a"].dtype == kind
+    assert kept["b"][1:] == ("text", 3.0)
 
 
 @pytest.mark.parametrize(
