@@ -268,8 +268,12 @@ SINCE ?=
 api: $(VENV)/dev ## list changes of the public Python API since the last release, or since SINCE
 	$(bin)/python -m tools.api $(SINCE)
 
-bench: $(VENV)/all ## measure the closed loop against raw physics
-	$(bin)/cloudrc bench
+# AGAINST=COMMIT compares with that commit; FLIGHTS=20 flies more often; ROWS=fast takes a part.
+AGAINST ?=
+FLIGHTS ?= 12
+ROWS ?=
+bench: $(VENV)/dev ## measure flights of all kinds beside steps; AGAINST=COMMIT: beside that commit
+	@$(bin)/python -m tools.bench --flights $(FLIGHTS) $(AGAINST:%=--against %) $(if $(ROWS),--rows '$(ROWS)')
 
 bench-cell: $(VENV)/all ## measure how punctual the cell of 50 robots is
 	$(bin)/python -m tools.bench_cell $(BENCH_CELL)

@@ -4,8 +4,9 @@
 
 The command flies the experiment `paper`. For comparison, it also measures two other workloads: one
 replays only the physics of this flight, in C (`mujoco.rollout`, one thread); the other flies the
-experiment as one flight of a sweep, which also computes the metrics. The command repeats each
-measurement and prints the shortest processor time.
+experiment as one flight of a sweep, which also computes the metrics. It also compares three flights
+with each other whose clouds compute more or less. The command repeats each measurement and prints
+the shortest processor time.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def arguments(parser: Parser) -> None:
 
 
 def execute(options: Options) -> None:
-    """Run all measurements; print for each the processor time per physics step [us]."""
+    """Run all measurements; print the processor time per physics step or per virtual time."""
     from cloudrc.cli.progress import Progress
     from cloudrc.runs.bench import as_text, bench
 

@@ -3,7 +3,8 @@
 """Measure how much processor time the closed loop needs on this machine.
 
 The measured flight is that of the experiment `paper`. For comparison, another workload replays only
-the physics of this flight, in C (`mujoco.rollout`, one thread).
+the physics of this flight, in C (`mujoco.rollout`, one thread). Flights whose cloud computes more
+are compared with `steps`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,14 @@ STEP = 0.002
 LIMIT_NS = 120_000_000_000
 """Time limit of a measured flight, in its virtual time [ns]."""
 RAW, LOOP = "raw mj_step", "closed loop, records in memory"
+STEPS = "steps"
+FLIGHTS: dict[str, tuple[tuple[str, tuple[str, ...]], float | None]] = {
+    STEPS: (("steps", ()), None),
+    "steps, model_based": (("steps", ("cloud.predictor=model_based",)), 1.6),
+    "fast over legs": (("fast", ("mission=legs",)), 4.0),
+}
+"""Name of a flight -> its experiment and settings, and the largest ratio of its processor time per
+virtual time to that of `steps` that `make bench` accepts; None: any."""
 
 
 def measure(parts: dict[str, Callable[[], Callable[[], int]]], repeats: int) -> dict[str, float]:
@@ -83,9 +93,9 @@ def flight(experiment: ResolvedExperiment) -> Callable[[], int]:
 
 
 def bench(repeats: int) -> dict[str, Any]:
-    """Measure the replay of the physics, the loop, and a flight of a sweep, each `repeats` times.
+    """Measure the replay of the physics, the loop, a flight of a sweep, and FLIGHTS.
 
-    Return the figures of each by its name, and which step flew.
+    Repeat each `repeats` times. Return the figures of each by its name, and which step flew.
     """
     experiment = load_experiment("paper")
     replayed = replay_of(experiment)
@@ -95,7 +105,10 @@ def bench(repeats: int) -> dict[str, Any]:
         LOOP: lambda: flight(experiment),
         "flight of a sweep, with its numbers": lambda: lambda: (fly_point(experiment), count)[1],
     }
+    for name, ((other, settings), _) in FLIGHTS.items():
+        parts[name] = partial(flight, load_experiment(other, settings))
     costs = measure(parts, repeats)
+    flights = {name: costs.pop(name) / STEP for name in FLIGHTS}
     figures = {
         name: {
             "us_per_step": cost * 1e6,
@@ -104,16 +117,24 @@ def bench(repeats: int) -> dict[str, Any]:
         }
         for name, cost in costs.items()
     }
-    return {"physics_steps": describe_steps(experiment.world), **figures}
+    beside = {
+        name: {"ms_per_second": cost * 1e3, "ratio_to_steps": cost / flights[STEPS]}
+        for name, cost in flights.items()
+    }
+    return {"physics_steps": describe_steps(experiment.world), **figures, "flights": beside}
 
 
 def as_text(document: Mapping[str, Any]) -> str:
     """Format the result of `bench` for people."""
     rows = [("experiment paper, mode virtual", "us a step", "ratio to raw", "x real time")]
     for name, each in document.items():
-        if name != "physics_steps":
+        if name not in ("physics_steps", "flights"):
             cost, ratio = f"{each['us_per_step']:.2f}", f"{each['ratio']:.3f}"
             rows.append((name, cost, ratio, f"{each['real_time_factor']:.0f}"))
     steps = document["physics_steps"]
     text = f"'{RAW}' ended in the same bits as the flight; steps of the flight: {steps}"
-    return f"{table(rows, right=(1, 2, 3))}\n\n{text}"
+    flights = [("flights, records in memory", "ms a second", "ratio to steps")]
+    for name, each in document["flights"].items():
+        flights.append((name, f"{each['ms_per_second']:.1f}", f"{each['ratio_to_steps']:.2f}"))
+    both = table(rows, right=(1, 2, 3)), table(flights, right=(1, 2))
+    return "\n\n".join((*both, text))

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Fly for `tools/bench.py`, with the sources that PYTHONPATH names: of this or of another commit.
+
+Each line of stdin is a flight as JSON: [experiment, settings, part]. Each line of stdout answers
+with the processor time of its pieces [s], its virtual time [s] and the hash of its records. The
+part "loop" is the flight in memory; the part "sweep" is a flight of a sweep, whose first piece
+builds the flight, and whose last one computes the metrics.
+
+This file names what it needs of cloudrc at two places, that of today and that of older commits.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import sys
+import time
+from functools import cache
+from importlib import import_module
+from itertools import pairwise
+from typing import Any
+
+LIMIT_NS = 300_000_000_000
+"""Time limit of a flight of the part "loop" [ns], virtual time."""
+FLY_POINT = "cloudrc.runs.flight", "cloudrc.sweep.flight"
+"""Modules that may have `fly_point`."""
+marks: list[float] = []
+"""Processor time of this thread when the flight began, and every 100 ms of virtual time [s]."""
+
+
+def note_pieces() -> None:
+    """Let every flight in virtual time note when a piece of it ends."""
+    from cloudrc.drivers.virtual import VirtualRun
+
+    fly = VirtualRun.fly
+
+    def fly_noted(self: Any, until: Any, limit_ns: int, sink: Any) -> None:
+        def noted(*records: Any) -> None:
+            sink(*records)
+            marks.append(time.thread_time())
+
+        marks.append(time.thread_time())
+        fly(self, until, limit_ns, noted)
+
+    VirtualRun.fly = fly_noted  # type: ignore[method-assign]
+
+
+@cache
+def load(experiment: str, settings: tuple[str, ...]) -> Any:
+    """Load an experiment, once."""
+    from cloudrc.config.load import load_experiment
+
+    return load_experiment(experiment, settings)
+
+
+def fly_point(experiment: Any) -> str:
+    """Fly as a sweep does; return the hash of the records, or the reason for none."""
+    for name in FLY_POINT:
+        try:
+            module = import_module(name)
+        except ModuleNotFoundError:
+            continue
+        row = module.fly_point(experiment)
+        return str(row["records_sha256"] or row)
+    raise ModuleNotFoundError(" and ".join(FLY_POINT))
+
+
+def fly_loop(experiment: Any) -> None:
+    """Fly, and keep the records in memory."""
+    from cloudrc.assembly import assemble
+
+    _, _, teleop, run, *_ = assemble(experiment)
+    records: list[Any] = []
+
+    def sink(*new: list[Any]) -> None:
+        for each in new:
+            records.extend(each)
+
+    gc.collect()
+    run.fly(lambda: teleop.over, LIMIT_NS, sink)
+
+
+@cache
+def hash_of(experiment: str, settings: tuple[str, ...]) -> str:
+    """Return the hash of a flight's records, of one flight that nobody measures."""
+    return fly_point(load(experiment, settings))
+
+
+def measure(experiment: str, settings: tuple[str, ...], part: str) -> dict[str, Any]:
+    """Fly once; return what the flight has cost."""
+    sha256, resolved = hash_of(experiment, settings), load(experiment, settings)
+    gc.collect()
+    marks.clear()
+    before = time.thread_time()
+    fly_point(resolved) if part == "sweep" else fly_loop(resolved)
+    after = time.thread_time()
+    ends = [before, *marks, after] if part == "sweep" else marks
+    pieces = [end - begin for begin, end in pairwise(ends)]
+    return {"pieces": pieces, "seconds": 0.1 * (len(marks) - 1), "sha256": sha256}
+
+
+def main() -> None:
+    """Answer until stdin ends."""
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what a flight prints is no answer
+    note_pieces()
+    for line in sys.stdin:
+        experiment, settings, part = json.loads(line)
+        print(json.dumps(measure(experiment, tuple(settings), part)), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main()
