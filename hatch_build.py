@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Put the machine code of the Pelican's steps, `step.c`, into a wheel, if CLOUDRC_NATIVE is 1.
+"""Put the machine code of the Pelican's steps and predictions into a wheel, if CLOUDRC_NATIVE is 1.
 
 Otherwise the wheel is pure Python, and a machine with a compiler makes the code when it flies.
 """

@@ -205,6 +205,11 @@ def _modules(package: str) -> list[str]:
     return [module.name for module in modules if not module.name.startswith("_")]
 
 
+def is_shipped(kind: str, name: str) -> bool:
+    """Return whether a plug-in is a file of cloudrc: one of its kind, or of a shipped robot."""
+    return bool(_own_module(kind, name))
+
+
 def _own_module(kind: str, name: str) -> str:
     """Return the name of the module of cloudrc that is a plug-in; "" for one from elsewhere."""
     if not is_path(name):

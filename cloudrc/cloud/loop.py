@@ -20,13 +20,16 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable
-from copy import deepcopy
+from copy import copy, deepcopy
+from functools import lru_cache
 from itertools import takewhile
 from math import nan
 from typing import Any
 
 from cloudrc.cloud.controllers import STAND_STILL, Controller, ControlOutput
+from cloudrc.cloud.controllers.pid import Pid
 from cloudrc.cloud.estimators import DelaySample, Estimator
+from cloudrc.cloud.motion import Body, pack_goal
 from cloudrc.cloud.news import SendOnDelta
 from cloudrc.cloud.plan_log import PlanLog
 from cloudrc.cloud.predictors import Predictor
@@ -47,7 +50,7 @@ from cloudrc.messages import (
 from cloudrc.outside.code import FAILURES, calling, check_failure, locate, stack_of
 from cloudrc.outside.values import RESULT, InvalidValueError
 from cloudrc.records import UNSENT, Control, Fault
-from cloudrc.teleop.carrot import path_of, setpoint_at
+from cloudrc.teleop.carrot import path_of
 from cloudrc.tunnel.codec import as_planned
 
 PERIOD_NS = 10_000_000
@@ -111,6 +114,10 @@ class ControlLoop:
         self._build_estimator, self._predictor = build_estimator, predictor
         self._controller = controller
         self._plans_itself: Any = getattr(controller, "plan", None)
+        self._law = controller.law if type(controller) is Pid else None
+        self._copy: Callable[[Controller], Controller] = deepcopy
+        if type(controller) is Pid:  # its state is numbers alone
+            self._copy = copy
         self._trusts_predictor, self._trusts_controller = is_ours(predictor), is_ours(controller)
         methods = (getattr(predictor, name) for name in ("observe", "commanded", "applied"))
         self._observe, self._commanded, self._applied = (
@@ -158,6 +165,9 @@ class ControlLoop:
         self._horizon, self._echoed_ns = 0.0, NEVER_NS
         self._guard, self._output = GuardState.GROUND, STAND_STILL
         self.plans = PlanLog()
+        self._moving: Setpoint | None = None  # that of the next two functions of cloud's time [ns]
+        self._later: Callable[[int], Setpoint]
+        self._goal_at: Callable[[int], bytes]
 
     def start_mission(self) -> None:
         """Reset the controller at the start of a mission within the session.
@@ -277,9 +287,8 @@ class ControlLoop:
             epoch: Number of the session, for the record.
             counter: Counter of the command's datagram, for the record.
         """
-        basis, moving, self._now_ns = self._basis, setpoint, now_ns
-        if moving.motion is not None:
-            setpoint = setpoint_at(moving, now_ns)
+        basis, self._now_ns = self._basis, now_ns
+        setpoint = self._look_ahead(setpoint, now_ns)
         assert basis is not None, "check `ready` first"
         self._horizon = horizon = self._estimate_horizon((now_ns - basis.stamp_ns) * 1e-9)
         estimate = self._predict(basis, horizon)
@@ -292,12 +301,12 @@ class ControlLoop:
             self.counts["frozen"] += 1
             if self._plans_itself:  # its last plan is no longer what the robot follows
                 self._call("controller", self._controller.reset)
-        elif self._plans_itself and (planned := self._ask_plan(moving, now_ns, dt)):
+        elif self._plans_itself and (planned := self._ask_plan(now_ns, dt)):
             output, plan, positions = planned
         else:
             output = self._steer(estimate, setpoint, dt)
             if self._planned and output is not None:
-                plan, positions = self._plan(moving, output.velocity, now_ns)
+                plan, positions = self._plan(output.velocity, now_ns)
         says_nothing, output = output is None, output or self._output
         held_ns = now_ns - self._basis_arrival_ns
         planned_ns = basis.stamp_ns + round(horizon * 1e9) if plan else NEVER_NS
@@ -348,14 +357,14 @@ class ControlLoop:
             return STAND_STILL
 
     def _ask_plan(
-        self, setpoint: Setpoint, now_ns: int, dt: float
+        self, now_ns: int, dt: float
     ) -> tuple[ControlOutput | None, list[Vector], list[Vector]] | None:
         """Let a controller plan by itself; return its command, and the results of `_plan`.
 
         Return None if the predictor has no model. If the controller plans nothing, the command is
         None. `now_ns` is the time of the command [ns], cloud's clock, `dt` that since the last [s].
         """
-        later, plug_in = path_of(setpoint), "predictor"
+        later, plug_in = self._later, "predictor"
         try:
             model = self._predictor.model()
             if model is None:
@@ -370,18 +379,15 @@ class ControlLoop:
             fits = takewhile(lambda velocity: max(map(abs, velocity)) <= PLANNED_MAX, rest)
             self._output = output = ControlOutput(command, RESULT.of(yaw_rate, "yaw rate"))
             positions = to_vectors(positions[: self._planned], "planned positions")
-            return output, list(map(as_planned, fits)), positions
+            return output, as_planned([*fits]), positions
         except FAILURES as error:
             self._note(plug_in, error, INSTEAD["controller"])
             return STAND_STILL, [], []
 
-    def _plan(
-        self, setpoint: Setpoint, velocity: Vector, now_ns: int
-    ) -> tuple[list[Vector], list[Vector]]:
+    def _plan(self, velocity: Vector, now_ns: int) -> tuple[list[Vector], list[Vector]]:
         """Plan the velocities [m/s] that follow a command, by simulating the flight.
 
         Args:
-            setpoint: Setpoint, which may move during the plan.
             velocity: Velocity of the command [m/s].
             now_ns: Time of the command [ns], cloud's clock.
 
@@ -390,19 +396,24 @@ class ControlLoop:
             was computed. The plan ends before the first velocity that the guard rejects. It is
             empty if the predictor has no model, or if a plug-in fails.
         """
-        plan, positions, plug_in = list[Vector](), list[Vector](), "predictor"
+        plan, positions, plug_in, most = list[Vector](), list[Vector](), "predictor", PLANNED_MAX
         try:
             model = self._predictor.model()
             if model is None:
                 return plan, positions
+            begin_ns = now_ns + PLAN_STEP_NS
+            times_ns = range(begin_ns, begin_ns + self._planned * PLAN_STEP_NS, PLAN_STEP_NS)
+            if self._law and isinstance(model, Body) and self._trusts_predictor:
+                goals = [*map(self._goal_at, times_ns)]
+                if flown := model.follow(self._law, goals, PLAN_STEP, velocity, most):
+                    return flown
             plug_in = "controller"
-            controller, later, most = deepcopy(self._controller), path_of(setpoint), PLANNED_MAX
-            for k in range(1, self._planned + 1):
+            controller = self._copy(self._controller)
+            for goal in map(self._later, times_ns):
                 plug_in = "predictor"
                 state = model.step(velocity, PLAN_STEP)
                 if not self._trusts_predictor:
                     state = check_estimate(state)
-                goal = later(now_ns + k * PLAN_STEP_NS)
                 plug_in = "controller"
                 output = controller.update(state, goal, PLAN_STEP)
                 if output is not None:
@@ -413,12 +424,23 @@ class ControlLoop:
                 if not (abs(x) <= most and abs(y) <= most and abs(z) <= most):
                     RESULT.row(velocity, 3, "planned velocity")
                     break
-                plan.append(as_planned(velocity))
+                plan.append(velocity)
                 positions.append(state.position)
         except FAILURES as error:
             self._note(plug_in, error, "cloud sends this command without a plan")
             return [], []
-        return plan, positions
+        return as_planned(plan), positions
+
+    def _look_ahead(self, setpoint: Setpoint, now_ns: int) -> Setpoint:
+        """Set `_later` and `_goal_at` of a setpoint that may move; return it at `now_ns` [ns].
+
+        They remember their results: the plans of two commands have most instants in common.
+        """
+        if setpoint is not self._moving:
+            later, remember = path_of(setpoint), lru_cache(maxsize=2 * (self._planned + 1))
+            self._moving, self._later = setpoint, remember(later)
+            self._goal_at = remember(lambda now_ns: pack_goal(later(now_ns)))
+        return setpoint if setpoint.motion is None else self._later(now_ns)
 
     def _call(self, kind: str, call: Callable[..., None], *arguments: Any) -> None:
         """Call a plug-in's method that has no result; count and report an exception."""

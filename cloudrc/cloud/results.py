@@ -23,14 +23,15 @@ SQUARE_ROUNDING = 1e-9
 """Deviation from 1 of an orientation's squared length that comes from rounding [1]."""
 OURS = "cloudrc.cloud.estimators.", "cloudrc.cloud.predictors.", "cloudrc.cloud.controllers.pid"
 """Beginnings of the modules whose plug-ins return what they should."""
-FOREIGN = ("cloudrc.cloud.predictors.model_based",)
-"""Modules among them whose plug-ins return what the files of a robot compute."""
 
 
 def is_ours(plug_in: Any) -> bool:
-    """Return whether the results of a plug-in need no judge, because cloudrc ships it."""
-    module = type(plug_in).__module__
-    return module.startswith(OURS) and module not in FOREIGN
+    """Return whether the results of a plug-in need no judge, because cloudrc ships it.
+
+    A predictor of cloudrc with a model from a user's file says that it `is_foreign`.
+    """
+    is_foreign = getattr(plug_in, "is_foreign", False)
+    return type(plug_in).__module__.startswith(OURS) and not is_foreign
 
 
 def check_estimate(estimate: Any) -> Odometry:

@@ -11,8 +11,9 @@ Deviation: the paper's tunnel sends pickled ROS messages, which have 1 kB and ca
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Sequence
 from enum import IntEnum
+from itertools import chain
 from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.messages import (
@@ -210,9 +211,10 @@ def encode_command(command: Command) -> bytes:
     return body + _PLANNED.pack(planned_ns) + b"".join([_VELOCITY.pack(*each) for each in plan])
 
 
-def as_planned(velocity: Vector) -> Vector:
-    """Round a velocity [m/s], shape (3,), to single precision, as a plan in a datagram has it."""
-    return _VELOCITY.unpack(_VELOCITY.pack(*velocity))
+def as_planned(velocities: Sequence[Vector]) -> list[Vector]:
+    """Round velocities [m/s] to single precision, as a plan in a datagram has them."""
+    data = struct.pack(f"<{3 * len(velocities)}f", *chain.from_iterable(velocities))
+    return list(_VELOCITY.iter_unpack(data))
 
 
 def decode_command(body: bytes) -> Command:

@@ -42,7 +42,8 @@ def planning(predictor=None, controller=None):
 def make_plan(controller, setpoint, velocity, now_ns, count):
     """Plan `count` commands for a robot at the origin."""
     a_loop = loop(None, Modelled(ZERO), controller, plan=0.01 * count)
-    return a_loop._plan(setpoint, velocity, now_ns)[0]
+    a_loop._look_ahead(setpoint, now_ns)
+    return a_loop._plan(velocity, now_ns)[0]
 
 
 def along_x(plan):

@@ -7,6 +7,7 @@ import json
 import pytest
 
 import cloudrc
+from cloudrc.cloud.results import is_ours
 from cloudrc.config.overrides import build_plugin, onboard_values
 from cloudrc.config.robot import facts, known_robot
 from cloudrc.config.schema import PlugIn, World
@@ -73,6 +74,12 @@ def test_a_model_of_ones_own_may_lie_in_the_folder_and_gets_the_parameters(own_r
     )
     with pytest.raises(BadInputError, match="7 20"):
         build(str(mine), {"name": "model_based"})
+    (mine / "own.py").write_text("def build(acceleration_max, tilt_max_deg):\n    return print\n")
+    for name in ("model_based", "kalman"):
+        assert is_ours(build("pelican", {"name": name}))
+        assert not is_ours(build(str(mine), {"name": name})), (
+            "what a user's model returns is judged"
+        )
 
 
 def test_identify_writes_a_response_for_a_robot_on_the_ground(

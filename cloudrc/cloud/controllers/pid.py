@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from math import hypot, inf
 from operator import add
+from typing import NamedTuple
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.config.schema import NotNegative, NotNegatives
@@ -20,6 +21,14 @@ GAIN_YAW = 0.8
 effect on both."""
 UNLIMITED: Vector = (inf, inf, inf)
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
+
+
+class Law(NamedTuple):
+    """A controller without limits and without memory: gains of the position and the velocity."""
+
+    gain_p: Vector  # [1/s]
+    gain_d: Vector  # [1]
+    has_derivative: bool
 
 
 class Pid(Controller):
@@ -72,6 +81,13 @@ class Pid(Controller):
         self._proportional_only = gain_i == ZERO and gain_d == ZERO
         self._limited = velocity_max is not None or speed_max is not None
         self._integral = ZERO
+
+    @property
+    def law(self) -> Law | None:
+        """The controller, if its velocity depends on the present error alone; else None."""
+        if self._limited or self._gain_i is not ZERO:
+            return None
+        return Law(self._gain_p, self._gain_d, not self._proportional_only)
 
     def reset(self) -> None:
         """Set the integral to zero at the start of a session or mission."""

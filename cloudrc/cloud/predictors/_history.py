@@ -38,7 +38,10 @@ class Replay(Predictor):
         commands: Those of the session, oldest first.
         stamps: Theirs [ns], cloud's clock.
         newest: The newest odometry sample.
+        is_foreign: Whether the model is that of a user's file.
     """
+
+    is_foreign = False
 
     def __init__(self) -> None:
         self.reset()
@@ -125,18 +128,24 @@ class Replay(Predictor):
                 break
         return reversed(parts)
 
-    def ahead(self, start_ns: int, end_ns: int, shift_ns: int) -> Iterator[tuple[Vector, float]]:
+    def ahead(self, start_ns: int, end_ns: int, shift_ns: int) -> list[tuple[Vector, float]]:
         """Predict which commands world follows from `start_ns` to `end_ns`, world's clock [ns].
 
-        Yield velocity [m/s] and duration [s] of each command. World begins to follow a command at
+        List velocity [m/s] and duration [s] of each command. World begins to follow a command at
         the command's stamp plus `shift_ns` [ns].
         """
-        index = bisect_right(self.stamps, start_ns - shift_ns)
+        stamps, commands, parts = self.stamps, self.commands, list[tuple[Vector, float]]()
+        index = bisect_right(stamps, start_ns - shift_ns)
         while start_ns < end_ns:
-            more = index < len(self.stamps)
-            until_ns = min(self.stamps[index] + shift_ns, end_ns) if more else end_ns
-            yield from self.followed(index, start_ns, until_ns)
+            until_ns = stamps[index] + shift_ns if index < len(stamps) else end_ns
+            if until_ns > end_ns:
+                until_ns = end_ns
+            if index and not commands[index - 1].plan:  # as `followed` does, without its call
+                parts.append((commands[index - 1].velocity, (until_ns - start_ns) * 1e-9))
+            else:
+                parts += self.followed(index, start_ns, until_ns)
             start_ns, index = until_ns, index + 1
+        return parts
 
     def followed(self, count: int, start_ns: int, end_ns: int) -> list[tuple[Vector, float]]:
         """List the velocities [m/s] of one command, and for how long world follows each [s].
@@ -148,16 +157,17 @@ class Replay(Predictor):
         command = self.commands[count - 1] if count else NO_COMMAND
         if not command.plan:
             return [(command.velocity, (end_ns - start_ns) * 1e-9)]
-        parts = list[tuple[Vector, float]]()
+        parts, planned_ns = list[tuple[Vector, float]](), command.planned_ns
         while start_ns < end_ns:
-            left_ns = PLAN_STEP_NS - (start_ns - command.planned_ns) % PLAN_STEP_NS
-            until_ns = min(start_ns + left_ns, end_ns)
+            until_ns = start_ns + PLAN_STEP_NS - (start_ns - planned_ns) % PLAN_STEP_NS
+            if until_ns > end_ns:
+                until_ns = end_ns
             parts.append((command.velocity_at(start_ns), (until_ns - start_ns) * 1e-9))
             start_ns = until_ns
         return parts
 
-    def observe(self, odometry: Odometry) -> None:
-        """Store the newest odometry sample."""
+    def observe(self, odometry: Odometry, forecast: Body | None = None) -> None:
+        """Store the newest odometry sample; `forecast` is that for its stamp, if it is known."""
         self.newest = odometry
 
     def roll(self, odometry: Odometry, horizon: float) -> Body:

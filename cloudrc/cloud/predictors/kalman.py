@@ -10,6 +10,7 @@ Source: docs/reference/control.md, "Predictors", (f).
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,7 +36,7 @@ class Kalman(Predictor):
         `position` [m] and `velocity` [m/s] are for the measured values, per axis. `model` [m/s^2]
         is for the acceleration of the filter's model.
         """
-        self._replay, self._error = replay, model * model
+        self._replay, self._error, self.is_foreign = replay, model * model, replay.is_foreign
         self._noise = np.diag([position * position, velocity * velocity])
         self.reset()
 
@@ -64,9 +65,10 @@ class Kalman(Predictor):
             model = np.array((forecast.position, forecast.velocity))
             measured = np.array((odometry.position, odometry.velocity))
             position, velocity = (model + gains @ (measured - model)).tolist()
-            estimate = odometry._replace(position=tuple(position), velocity=tuple(velocity))
+            stamp_ns, _, orientation, _, rate = odometry
+            estimate = Odometry(stamp_ns, tuple(position), orientation, tuple(velocity), rate)
         self._estimate = estimate
-        self._replay.observe(estimate)
+        self._replay.observe(estimate, forecast)
 
     def _update(self, dt: float) -> Array:
         """Advance the covariance by `dt` [s] and one sample; return the gains K, shape (2, 2).
@@ -76,8 +78,8 @@ class Kalman(Predictor):
             P = F P F' + q · (dt^2/2, dt)' (dt^2/2, dt);  K = P (P + R)^-1;  P = (1 - K) P.
         Source: R. E. Kalman, "A New Approach to Linear Filtering and Prediction Problems", 1960.
         """
-        ahead, push = np.array(((1.0, dt), (0.0, 1.0))), np.array((0.5 * dt * dt, dt))
-        covariance = ahead @ self._covariance @ ahead.T + self._error * np.outer(push, push)
+        ahead, pushed = _motion(dt, self._error)
+        covariance = ahead @ self._covariance @ ahead.T + pushed
         gains: Array = covariance @ np.linalg.inv(covariance + self._noise)
         self._covariance = covariance - gains @ covariance
         return gains
@@ -96,6 +98,16 @@ class Kalman(Predictor):
     def model(self) -> Model | None:
         """Return the robot's model in the last predicted state; None before any prediction."""
         return self._replay.model()
+
+
+@lru_cache(maxsize=64)  # telemetry comes in whole periods
+def _motion(dt: float, variance: float) -> tuple[Array, Array]:
+    """Return F, and the covariance after an acceleration error during `dt` [s], shape (2, 2) each.
+
+    `variance` is that of the error [m^2/s^4].
+    """
+    push = np.array((0.5 * dt * dt, dt))
+    return np.array(((1.0, dt), (0.0, 1.0))), variance * np.outer(push, push)
 
 
 def build(

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from copy import copy
 from typing import Any
 
+from cloudrc import plugins
 from cloudrc.cloud.motion import Body
 from cloudrc.cloud.predictors import command_history
 from cloudrc.cloud.predictors._history import Replay
@@ -30,9 +31,9 @@ GAP_NS = 500_000_000
 class ModelBased(Replay):
     """Simulates a model of the robot from the newest odometry to the horizon."""
 
-    def __init__(self, start: Callable[[Odometry], Body]) -> None:
-        """Set the function that starts a model in a measured state."""
-        self._start = start
+    def __init__(self, start: Callable[[Odometry], Body], *, is_foreign: bool) -> None:
+        """Set the function that starts a model in a measured state; a user's file `is_foreign`."""
+        self._start, self.is_foreign = start, is_foreign
         super().__init__()
 
     def reset(self) -> None:
@@ -47,14 +48,13 @@ class ModelBased(Replay):
             return None
         if self.is_silent(stamp_ns):  # the guard holds the robot
             return None
-        for velocity, duration in self.past(body.basis.stamp_ns, stamp_ns):
-            body.advance(velocity, duration)
+        body.replay(self.past(body.basis.stamp_ns, stamp_ns))
         return body
 
-    def observe(self, odometry: Odometry) -> None:
-        """Correct the model of the robot with a new odometry sample."""
+    def observe(self, odometry: Odometry, forecast: Body | None = None) -> None:
+        """Correct the model of the robot with a new sample; `forecast` is that for its stamp."""
         super().observe(odometry)
-        self._body = self.forecast(odometry.stamp_ns) or self._start(odometry)
+        self._body = forecast or self.forecast(odometry.stamp_ns) or self._start(odometry)
         self._body.correct(odometry)
 
     def roll(self, odometry: Odometry, horizon: float) -> Body:
@@ -65,8 +65,7 @@ class ModelBased(Replay):
         body = copy(self._body)
         start_ns, shift_ns = odometry.stamp_ns, self.shift_ns(odometry, horizon)
         end_ns = start_ns + round(horizon * 1e9)
-        for velocity, duration in self.ahead(start_ns, end_ns, shift_ns):
-            body.advance(velocity, duration)
+        body.replay(self.ahead(start_ns, end_ns, shift_ns))
         body.horizon = horizon
         return body
 
@@ -99,4 +98,5 @@ def build(
     given = {**(robot.motion.model_extra or {}), **onboard}
     given["acceleration_max"] = acceleration_max or robot.acceleration_max
     choice = PlugIn.model_validate({**given, "name": robot.motion.name})
-    return ModelBased(build_plugin("motion", choice))
+    is_foreign = not plugins.is_shipped("motion", choice.name)
+    return ModelBased(build_plugin("motion", choice), is_foreign=is_foreign)

@@ -14,9 +14,12 @@ docs/reference/onboard.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from array import array
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from math import ceil, sqrt
+from struct import Struct
+from typing import TYPE_CHECKING
 
 from cloudrc.cloud.motion import Body
 from cloudrc.config.schema import NotNegative, NotNegatives, Positive
@@ -34,8 +37,12 @@ from cloudrc.robots.pelican.low_level import (
     ROBOT_MASS,
     TILT_RATE_GAIN,
 )
+from cloudrc.robots.pelican.native.library import Library, library
 from cloudrc.robots.pelican.rotors import TIME_CONSTANT_DOWN, TIME_CONSTANT_UP
 from cloudrc.world.guard.limits import LOW_HEIGHT, LOW_SPEED, SINK_LEAD_MAX
+
+if TYPE_CHECKING:
+    from cloudrc.cloud.controllers.pid import Law
 
 STEP = 0.010
 """Longest time step of the model [s]."""
@@ -53,6 +60,13 @@ FLOOR_MARGIN = 0.35
 """Height below which the guard does not descend [m]. Source: docs/safety.md, "Limits"."""
 THRUST_MAX = 134.9
 """Largest thrust of the four rotors [N]. Source: docs/reference/plant.md, "Rotor speed"."""
+CONSTANTS = (
+    STEP, ROBOT_MASS, ROBOT_GRAVITY, ASSUMED_WEIGHT, INERTIA_X, INERTIA_Y, LAG, TIME_CONSTANT_UP,
+    TIME_CONSTANT_DOWN, DRAG, THRUST_MAX, TILT_RATE_GAIN, FLOOR_MARGIN, LOW_HEIGHT, LOW_SPEED,
+    SINK_LEAD_MAX,
+)  # fmt: skip
+"""The first numbers of the structure `Body` of `native/motion.c`."""
+_STATE, _VECTOR = Struct("24d"), Struct("3d")
 GAIN_ACCELERATION, GAIN_TORQUE = 0.3, 0.1
 """Rates at which the estimated acceleration and torque follow the errors of a prediction [1/s]. The
 rate of the torque falls from 1 to GAIN_TORQUE, because other errors disturb the estimate."""
@@ -62,17 +76,26 @@ class WhiteBox(Body):
     """Model of the robot and of its onboard controller, which holds the yaw at 0.
 
     The body rates turn the axis of the thrust: a unit vector (nx, ny, nz) in the world frame.
+    `native/motion.c` advances it under many commands at once, with the same bits.
     """
 
-    def __init__(self, gains: tuple[float, ...], acceleration_max: float, basis: Odometry) -> None:
+    def __init__(
+        self,
+        gains: tuple[float, ...],
+        acceleration_max: float,
+        native: Library,
+        basis: Odometry,
+    ) -> None:
         """Start the model in a measured state; assume steady flight, in which thrust equals weight.
 
         Args:
             gains: P, I, D gains and integral limits of the velocity loop, for x, y, z: shape (12,).
             acceleration_max: The guard's cap on the acceleration [m/s^2].
+            native: The compiled `motion.c`, if there is one.
             basis: The measured state.
         """
-        self._gains, self._acceleration_max = gains, acceleration_max
+        self._gains, self._acceleration_max, self._native = gains, acceleration_max, native
+        self._fixed = array("d", (*CONSTANTS, *gains, acceleration_max)).tobytes()
         self._reference, self._thrust = basis.velocity, ASSUMED_WEIGHT
         self._integral = self._missed = ZERO  # _missed: acceleration that the model lacks [m/s^2]
         self._age = 0.0  # of the estimates [s]
@@ -142,6 +165,54 @@ class WhiteBox(Body):
         self._axis, self._rate, self._torque = (nx, ny), (qx, qy), (tx, ty)
         self._thrust, self._reference = thrust, last
 
+    def replay(self, commands: Iterable[tuple[Vector, float]]) -> None:
+        """Advance the state under several commands: velocity [m/s] and duration [s] of each."""
+        advance = self._native.advance
+        if advance is None:
+            super().replay(commands)
+            return
+        rows = array("d", [number for (x, y, z), dt in commands for number in (x, y, z, dt)])
+        body = self._pack()
+        advance(_address(body), _address(rows), len(rows) // 4, None)
+        self._unpack(body)
+
+    def follow(
+        self, law: Law, goals: Sequence[bytes], dt: float, velocity: Vector, most: float
+    ) -> tuple[list[Vector], list[Vector]] | None:
+        """Simulate a flight in which `law` computes the next velocity after each `dt` [s].
+
+        None without C, or if a component of a velocity is above `most` [m/s].
+        """
+        plan, count = self._native.plan, len(goals)
+        if plan is None:
+            return None
+        body, rows, flown = self._pack(), array("d", b"".join(goals)), array("d", bytes(48 * count))
+        gain_p, gain_d, has_derivative = law
+        given = array("d", (*gain_p, *gain_d, has_derivative, *velocity, dt, most))
+        begin, law_at, goals_at = _address(body), _address(given), _address(rows)
+        if plan(begin, law_at, goals_at, count, _address(flown)) < count:
+            return None
+        vectors = [*_VECTOR.iter_unpack(flown)]
+        return vectors[:count], vectors[count:]
+
+    def _pack(self) -> array[float]:
+        """Return the numbers of the structure `Body` of `native/motion.c`, in its order."""
+        return array("d", self._fixed + _STATE.pack(
+            *self._missed, *self._trim, *self._reference, *self._integral,
+            self._thrust, *self._torque, *self.position, *self.velocity, *self._axis, *self._rate,
+        ))  # fmt: skip
+
+    def _unpack(self, body: array[float]) -> None:
+        """Take over the state of a structure `Body`: its last 19 numbers."""
+        # fmt: off
+        (
+            ax, ay, az, bx, by, bz, self._thrust, tx, ty, px, py, pz, vx, vy, vz, nx, ny, qx, qy,
+        ) = body[-19:]
+        # fmt: on
+        self._reference, self._integral, self._torque = (ax, ay, az), (bx, by, bz), (tx, ty)
+        self.position, self.velocity = (px, py, pz), (vx, vy, vz)
+        self._axis, self._rate = (nx, ny), (qx, qy)
+
     def _force(
         self, last: Vector, reference: Vector, velocity: Vector, acceleration: Vector, h: float
     ) -> Vector:
@@ -166,6 +237,10 @@ class WhiteBox(Body):
             py * ey + iy * sy + dy * ((ry - last_y) / h - ay),
             pz * ez + iz * sz + dz * ((rz - last_z) / h - az) + ASSUMED_WEIGHT,
         )
+
+
+def _address(numbers: array[float]) -> int:
+    return numbers.buffer_info()[0]
 
 
 def _limit(reference: Vector, last: Vector, height: float, climb: float) -> Vector:
@@ -203,4 +278,4 @@ def build(
         integral_limit_z: Limit of the loop's integrated velocity error in z [m].
     """
     limits = integral_limit_xy, integral_limit_xy, integral_limit_z
-    return partial(WhiteBox, (*gain_p, *gain_i, *gain_d, *limits), acceleration_max)
+    return partial(WhiteBox, (*gain_p, *gain_i, *gain_d, *limits), acceleration_max, library())

