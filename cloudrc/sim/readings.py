@@ -37,9 +37,8 @@ class Readings(NamedTuple):
 
     def on_ground(self) -> Readings:
         """Return the readings without height and vertical velocity, for a planar robot."""
-        x, y, _ = self.position
-        vx, vy, _ = self.velocity
-        return self._replace(position=(x, y, 0.0), velocity=(vx, vy, 0.0))
+        (x, y, _), orientation, (vx, vy, _), rate, axes = self
+        return _new(Readings, ((x, y, 0.0), orientation, (vx, vy, 0.0), rate, axes))
 
     @classmethod
     def of(cls, pose: Iterable[float], twist: Iterable[float]) -> Readings:

@@ -23,12 +23,17 @@ class RotorDrag(Direct):
         """
         super().__init__(model.nu)
         # Place of each rotor, its axis, and its drag per control and velocity.
-        self._rotors: list[tuple[float, ...]] = []
+        rotors: list[tuple[float, ...]] = []
         places, forces = read_thrusters(model)
         for place, force in zip(places, forces, strict=True):
             thrust = float(np.linalg.norm(force))
             axis = force / thrust if thrust else force
-            self._rotors.append((*place.tolist(), *axis.tolist(), drag * thrust))
+            rotors.append((*place.tolist(), *axis.tolist(), drag * thrust))
+        # All rotors are in one of the two lists: those of most robots push along z alone.
+        self._upright = [(x, y, z, drag) for x, y, z, *_, drag in rotors]
+        self._tilted = list[tuple[float, ...]]()
+        if any(rotor[3:6] != (0.0, 0.0, 1.0) for rotor in rotors):
+            self._upright, self._tilted = [], rotors
 
     def step(self, commands: Commands, readings: Readings) -> Inputs:
         """Return the commands, and the drag as a force [N] and a torque [N m].
@@ -42,7 +47,15 @@ class RotorDrag(Direct):
         v = yx * vx + yy * vy + yz * vz
         w = zx * vx + zy * vy + zz * vz
         force_x = force_y = force_z = torque_x = torque_y = torque_z = 0.0
-        for command, (x, y, z, ax, ay, az, drag) in zip(commands, self._rotors, strict=True):
+        for command, (x, y, z, drag) in zip(commands, self._upright, strict=False):
+            scale = -drag * abs(command)  # without the part along the axis, which is 0
+            fx, fy = scale * (u + q * z - r * y), scale * (v + r * x - p * z)
+            force_x += fx
+            force_y += fy
+            torque_x -= z * fy
+            torque_y += z * fx
+            torque_z += x * fy - y * fx
+        for command, (x, y, z, ax, ay, az, drag) in zip(commands, self._tilted, strict=False):
             hub_x, hub_y, hub_z = u + q * z - r * y, v + r * x - p * z, w + p * y - q * x
             along = hub_x * ax + hub_y * ay + hub_z * az
             scale = -drag * abs(command)

@@ -3,6 +3,7 @@
 """No limit can be switched off, and the arithmetic keeps them for any float."""
 
 from math import hypot, inf, isfinite, nan
+from unittest.mock import patch
 
 import pytest
 from hypothesis import given, settings
@@ -115,6 +116,14 @@ def test_limit_to_fence_lets_the_robot_stop_before_each_face(velocity, position)
     for v, at, low, high in axes:
         room = high - at if v > 0 else at - low
         assert v == 0.0 or 0.2 * abs(v) + v * v / 6 <= room - 0.1 + 1e-12 or room > 5
+
+
+@given(SPEEDS, PLACES)
+@MANY
+def test_a_quick_look_at_faces_that_are_far_changes_no_bit(velocity, position):
+    quick = fenced(velocity, position)
+    with patch.object(rules, "ROOM", inf):  # no face is far
+        assert repr(fenced(velocity, position)) == repr(quick)
 
 
 @pytest.mark.parametrize(
