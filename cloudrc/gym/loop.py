@@ -263,7 +263,8 @@ class RemoteLoop:
         if self._executor.asks(tick, observation):
             committed = self._executor.committed(tick)
             message = (tick, committed, copied(observation), dict(info))
-            self._up.send(tick, now_ns, message, size_of(committed.actions))
+            more = size_of(committed.actions) if committed.actions else 0
+            self._up.send(tick, now_ns, message, more)
         self._ask(now_ns + self._within_ns)
         if self._seen_tick:
             self._observation_ages.append(tick - self._seen_tick)

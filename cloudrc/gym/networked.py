@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, Unpack
 
 import gymnasium
+import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from cloudrc.gym.links import Links
@@ -128,7 +129,8 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Send the policy's answer, and step the world with what the robot executes."""
-        action = to_arrays(action)
+        if type(action) is not np.ndarray:
+            action = to_arrays(action)
         self._check(action)
         loop = self._loop
         executed = loop.act(self._split(action))

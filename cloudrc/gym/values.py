@@ -96,9 +96,12 @@ def _check(space: spaces.Space[Any], what: str, action: Any) -> None:
 def _judge(space: spaces.Space[Any], action: Any) -> None:
     """Raise a ValueError if an action does not have the form of a space."""
     if isinstance(space, spaces.Box):
-        if np.shape(action) != space.shape:
+        shape = action.shape if type(action) is np.ndarray else np.shape(action)
+        if shape != space.shape:
             raise ValueError
         RESULT.array(action)
+    elif isinstance(space, spaces.Discrete) and type(action) in (int, np.int64):
+        _choose(space, action)
     elif isinstance(space, spaces.Dict):
         if not isinstance(action, Mapping) or action.keys() != space.keys():
             raise ValueError
@@ -109,4 +112,10 @@ def _judge(space: spaces.Space[Any], action: Any) -> None:
         if not space.contains((given.astype(int) if given.dtype == bool else given)[()]):
             raise ValueError
     elif action is None:
+        raise ValueError
+
+
+def _choose(space: spaces.Discrete, action: Any) -> None:
+    """Judge a whole number as `contains` does, in less time."""
+    if not 0 <= action - space.start < space.n:
         raise ValueError

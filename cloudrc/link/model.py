@@ -27,11 +27,13 @@ def enqueue(
     `departures`: when the packets before it leave [ns]; `size`: with its headers [bytes];
     `rate`: of the bottleneck [bit/s].
     """
-    if not _has_room(departures, packets_max, now_ns):
+    while departures and departures[0] <= now_ns:  # as in `_has_room`, without its call
+        departures.popleft()
+    if len(departures) >= packets_max:
         return None
-    start = departures[-1] if departures else now_ns
-    departures.append(start + round(size * 8e9 / rate))
-    return departures[-1]
+    leaves_ns = (departures[-1] if departures else now_ns) + round(size * 8e9 / rate)
+    departures.append(leaves_ns)
+    return leaves_ns
 
 
 def _has_room(departures: deque[int], packets_max: int, now_ns: int) -> bool:
@@ -200,7 +202,13 @@ class LinkDirection:
         """
         arrival = now_ns
         if entry != OVERTAKES:
-            departure = self._departure(conditions, size + HEADER_BYTES, now_ns)
+            departure: int | None = now_ns
+            if conditions.rate is not None:
+                most = self._profile.queue_packets
+                size += HEADER_BYTES
+                departure = enqueue(self._departures, size, conditions.rate, most, now_ns)
+            elif self._opportunities is not None:
+                departure = self._use_opportunity(size + HEADER_BYTES, now_ns)
             if departure is None:
                 return None
             arrival = departure
@@ -211,13 +219,10 @@ class LinkDirection:
             arrival = self._last_release_ns = max(arrival, self._last_release_ns)
         return arrival
 
-    def _departure(self, conditions: Conditions, size: int, now_ns: int) -> int | None:
+    def _use_opportunity(self, size: int, now_ns: int) -> int | None:
         """Return when a packet of `size` bytes leaves the bottleneck [ns]; None: it is full."""
         departures, most = self._departures, self._profile.queue_packets
-        if conditions.rate is not None:
-            return enqueue(departures, size, conditions.rate, most, now_ns)
-        if self._opportunities is None:
-            return now_ns
+        assert self._opportunities is not None
         if not _has_room(departures, most, now_ns):
             return None
         origin_ns = self._origin_ns or 0

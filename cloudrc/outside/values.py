@@ -26,6 +26,8 @@ SHOWN_MAX = 60
 LARGEST = 1e30
 """Largest size of a number that users' code returns [any unit]. Metrics square numbers, and the
 report's page stores some with single precision: a much larger number overflows there."""
+FEW = 32
+"""Up to this count, numbers in a list take less time than in an array [1]."""
 HUGE = 1e18
 """Size from which on an error does not name a limit [any unit]."""
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
@@ -91,7 +93,7 @@ class Quantity:
             found = np.asarray(found)
         except ValueError:  # rows of unequal lengths
             self.of(values, name)
-        if found.size and not self._spans(found.min().item(), found.max().item()):
+        if found.size and not self._has_all(found):
             place = np.argwhere(~self._contains(found))[0].tolist()
             self.of(found[tuple(place)].item(), _at(place, name))
         return found
@@ -112,6 +114,14 @@ class Quantity:
         if {*map(type, values)} == {float}:  # the usual case, which must be fast
             return values
         return [self._numbers(each, (*place, n), name) for n, each in enumerate(values)]
+
+    def _has_all(self, numbers: NDArray[Any]) -> bool:
+        """Return whether all numbers of an array are in the range and finite."""
+        if numbers.size <= FEW and numbers.dtype.kind == "f":
+            few = numbers.ravel().tolist()
+            if isfinite(sum(few)):  # the least of several numbers may hide a NaN
+                return self._spans(min(few), max(few))
+        return self._spans(numbers.min().item(), numbers.max().item())
 
     def _spans(self, low: float, high: float) -> bool:
         """Return whether all numbers from `low` to `high` are in the range and finite."""

@@ -30,6 +30,9 @@ class Committed(NamedTuple):
     delay: int = 0  # how many of them it executes, as it expects, before the answer arrives
 
 
+NOTHING = Committed()
+
+
 class Executor:
     """Chooses the robot's action; it runs on the robot.
 
@@ -67,7 +70,7 @@ class Executor:
 
     def committed(self, tick: int) -> Committed:
         """Return what travels with the observation of this tick; by default, nothing."""
-        return Committed()
+        return NOTHING
 
     def receive(self, chunk: Chunk, tick: int) -> None:
         """Take an answer that arrived before or at this tick. An older one may come later."""
