@@ -70,6 +70,8 @@ INSTEAD = {
 GOES_ON = "cloud goes on using it"
 PLAN_STEP = PLAN_STEP_NS * 1e-9
 """Time between two velocities of a plan [s]."""
+INSTANTS = 256
+"""For how many instants the loop remembers the setpoint: more than two successive plans have."""
 PLANNED_MAX = 1000.0
 """Largest component of a planned velocity [m/s]; the guard takes no plan with a larger one.
 Source: docs/reference/faults.md, "F23"."""
@@ -437,7 +439,7 @@ class ControlLoop:
         They remember their results: the plans of two commands have most instants in common.
         """
         if setpoint is not self._moving:
-            later, remember = path_of(setpoint), lru_cache(maxsize=2 * (self._planned + 1))
+            later, remember = path_of(setpoint), lru_cache(maxsize=INSTANTS)
             self._moving, self._later = setpoint, remember(later)
             self._goal_at = remember(lambda now_ns: pack_goal(later(now_ns)))
         return setpoint if setpoint.motion is None else self._later(now_ns)

@@ -47,6 +47,14 @@ class Body(Model):
         for velocity, duration in commands:
             self.advance(velocity, duration)
 
+    def coast(self, velocity: Vector, dt: float, count: int) -> list[tuple[Vector, Vector]]:
+        """Advance by `dt` [s], `count` times, under one command `velocity` [m/s].
+
+        Return the position [m] and the velocity [m/s] after each step.
+        """
+        states = (self.step(velocity, dt) for _ in range(count))
+        return [(state.position, state.velocity) for state in states]
+
     def follow(
         self, law: Law, goals: Sequence[bytes], dt: float, velocity: Vector, most: float
     ) -> tuple[list[Vector], list[Vector]] | None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from cloudrc.cloud.controllers import Controller, ControlOutput, Goals, Planned
 from cloudrc.cloud.controllers.pid import GAIN_YAW
+from cloudrc.cloud.motion import Body
 from cloudrc.cloud.predictors import Model
 from cloudrc.cloud.predictors.command_history import Axes, FirstOrder
 from cloudrc.config.robot import RobotFacts
@@ -99,9 +100,9 @@ class Mpc(Controller):
     def plan(self, model: Model, goals: Goals, dt: float) -> Planned:
         """Compute the velocities from now on; `dt` is the time since the last command [s]."""
         present = self._present(dt)
-        states = [model.step(present, LOOK) for _ in range(AHEAD)]
-        positions = np.array([each.position for each in states])
-        velocities = np.array([each.velocity for each in states])
+        begin = model.step(present, LOOK)
+        states = [(begin.position, begin.velocity), *_coast(model, present)]
+        positions, velocities = map(np.array, zip(*states, strict=True))
         wanted, speeds = self._approach(positions[0], goals)
         errors = np.concatenate((wanted - positions, speeds - velocities))
         changes = self._optimum(errors.T[:, :, None], np.array(present)[:, None])
@@ -112,7 +113,7 @@ class Mpc(Controller):
         positions += (self._position @ changes[:, :, None])[:, :, 0].T
         velocities += (self._velocity @ changes[:, :, None])[:, :, 0].T
         first = goals(0.0)
-        yaw_rate = first.turns and GAIN_YAW * turn_to(first.yaw, states[0].orientation_wxyz)
+        yaw_rate = first.turns and GAIN_YAW * turn_to(first.yaw, begin.orientation_wxyz)
         between = positions - STEP * velocities
         every = np.stack((between, positions), axis=1).reshape(commands.shape)
         return Planned(commands, every, float(yaw_rate))
@@ -162,6 +163,14 @@ class Mpc(Controller):
             cost = self._cost[axis]
             changes[axis] = self._solve(cost, -cost @ changes[axis], self._sums, high, low)[0]
         return changes
+
+
+def _coast(model: Model, velocity: Vector) -> list[tuple[Vector, Vector]]:
+    """Return the further positions [m] and velocities [m/s] under one command [m/s]."""
+    if isinstance(model, Body):
+        return model.coast(velocity, LOOK, AHEAD - 1)
+    states = (model.step(velocity, LOOK) for _ in range(AHEAD - 1))
+    return [(state.position, state.velocity) for state in states]
 
 
 def _responses(axes: Axes) -> Any:

@@ -176,6 +176,20 @@ class WhiteBox(Body):
         advance(_address(body), _address(rows), len(rows) // 4, None)
         self._unpack(body)
 
+    def coast(self, velocity: Vector, dt: float, count: int) -> list[tuple[Vector, Vector]]:
+        """Advance by `dt` [s], `count` times, under one command `velocity` [m/s]."""
+        advance = self._native.advance
+        if advance is None:
+            return super().coast(velocity, dt, count)
+        body, states = self._pack(), array("d", bytes(48 * count))
+        rows = array("d", (*velocity, dt) * count)
+        advance(_address(body), _address(rows), count, _address(states))
+        self._unpack(body)
+        for _ in range(count):  # a sum, as in Python
+            self.horizon += dt
+        vectors = [*_VECTOR.iter_unpack(states)]
+        return [*zip(vectors[::2], vectors[1::2], strict=True)]
+
     def follow(
         self, law: Law, goals: Sequence[bytes], dt: float, velocity: Vector, most: float
     ) -> tuple[list[Vector], list[Vector]] | None:

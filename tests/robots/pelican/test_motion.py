@@ -47,6 +47,10 @@ def test_commands_move_the_model_the_same_in_c(seed, height, monkeypatch):
         for model in (python, c):
             model.replay(commands)
         assert state(python) == state(c)
+        assert python.coast((scale, 0.0, -scale), 0.02, 39) == c.coast(
+            (scale, 0.0, -scale), 0.02, 39
+        )
+        assert python.odometry() == c.odometry()
 
 
 @pytest.mark.parametrize("gain_d", [ZERO, (0.5, 0.5, 0.0)])
