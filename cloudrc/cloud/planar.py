@@ -11,7 +11,7 @@ import numpy as np
 from cloudrc.cloud.controllers import Controller, ControlOutput, Goals, Planned
 from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.cloud.predictors import Model
-from cloudrc.cloud.results import check_output
+from cloudrc.cloud.results import check_output, is_ours
 from cloudrc.errors import ControllerLostError
 from cloudrc.messages import Odometry, Setpoint
 from cloudrc.outside.values import InvalidValueError
@@ -27,6 +27,7 @@ class Planar(Controller):
     def __init__(self, controller: Controller, name: str) -> None:
         """Wrap `controller`; errors call it `name`."""
         self._controller, self._name = controller, name
+        self.is_foreign = not is_ours(controller)
         self._ask_plan: Any = getattr(controller, "plan", None)
         if self._ask_plan:
             self.plan = self._plan_level
@@ -50,19 +51,20 @@ class Planar(Controller):
             InvalidValueError: If the controller commands a vertical velocity.
             ControllerLostError: If a program outside does so.
         """
-        x, y, _ = estimate.position
-        vx, vy, _ = estimate.velocity
-        level = estimate._replace(position=(x, y, setpoint.position[2]), velocity=(vx, vy, 0.0))
+        stamp_ns, (x, y, _), orientation, (vx, vy, _), rate = estimate
+        height = setpoint.position[2]
+        level = Odometry(stamp_ns, (x, y, height), orientation, (vx, vy, 0.0), rate)
         rx, ry, _ = setpoint.velocity
         if setpoint.velocity[2]:
             setpoint = setpoint._replace(velocity=(rx, ry, 0.0))
         output = self._controller.update(level, setpoint, dt)
         if output is None:
             return None
-        output = check_output(output)
+        if self.is_foreign:
+            output = check_output(output)
         x, y, z = output.velocity
         if abs(z) <= ROUNDING:
-            return output._replace(velocity=(x, y, 0.0))
+            return ControlOutput((x, y, 0.0), *output[1:])
         text = f"{self._name}: its velocity in z is {z:.4g} m/s, but the robot stays on the ground"
         if isinstance(self._controller, OutsideController):
             raise ControllerLostError(CONTROLLER_LOST[1], text)

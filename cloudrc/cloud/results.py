@@ -21,14 +21,20 @@ SQUARE_TOLERANCE = 0.01
 first-order integration, is scaled away. ROS's tf2 accepts the same deviation."""
 SQUARE_ROUNDING = 1e-9
 """Deviation from 1 of an orientation's squared length that comes from rounding [1]."""
-OURS = "cloudrc.cloud.estimators.", "cloudrc.cloud.predictors.", "cloudrc.cloud.controllers.pid"
+OURS = (
+    "cloudrc.cloud.estimators.",
+    "cloudrc.cloud.predictors.",
+    "cloudrc.cloud.controllers.pid",
+    "cloudrc.cloud.planar",
+)
 """Beginnings of the modules whose plug-ins return what they should."""
 
 
 def is_ours(plug_in: Any) -> bool:
     """Return whether the results of a plug-in need no judge, because cloudrc ships it.
 
-    A predictor of cloudrc with a model from a user's file says that it `is_foreign`.
+    What hands on the results of a user's file, such as a predictor with his model, says that it
+    `is_foreign`.
     """
     is_foreign = getattr(plug_in, "is_foreign", False)
     return type(plug_in).__module__.startswith(OURS) and not is_foreign

@@ -48,7 +48,7 @@ class DiffDrive:
         `turn_gain` is in [1/s], `turn_rate_max` in [rad/s]; `build` describes them.
         """
         self.stopped: Commands = (0.0,) * len(wheels)
-        self._wheels = tuple(wheels)
+        self._wheels = [(wheel.y, wheel.command) for wheel in wheels]
         self._turn_gain = turn_gain
         self._speed_max = min(wheel.speed_max for wheel in wheels)
         self._half_track = max(abs(wheel.y) for wheel in wheels)
@@ -85,10 +85,11 @@ class DiffDrive:
 
     def _wheel_speeds(self, ahead: float, turn: float) -> Commands:
         """Return commands for a speed [m/s] and a yaw rate [rad/s]; turning comes first."""
-        turn = max(min(turn, self._turn_rate_max), -self._turn_rate_max)
+        most = self._turn_rate_max
+        turn = most if turn > most else -most if turn < -most else turn
         rest = self._speed_max - abs(turn) * self._half_track
         ahead = max(min(ahead, rest), -rest)
-        return tuple([(ahead - turn * wheel.y) * wheel.command for wheel in self._wheels])
+        return tuple([(ahead - turn * y) * command for y, command in self._wheels])
 
 
 def build(

@@ -96,6 +96,12 @@ class Multirotor:
         self._lead_max = self._ahead_max / gains.velocity
         self._climb_lead_max = gravity / (CLIMB * gains.velocity)
         self._rise_max = min(RISE * (self._thrust_max - gravity), gravity)
+        # Numbers of each step; the products have the order of the formulas.
+        b, climb = gains.velocity, CLIMB * gains.velocity
+        self._planned_max, self._sink_max = AHEAD * self._ahead_max, -SINK * gravity
+        self._up_min, self._heave_max = THRUST_MIN * gravity, WEIGHT * gravity
+        self._thrust_square = self._thrust_max * self._thrust_max
+        self._bandwidths = b, climb, 0.5 * gains.attitude * dt, 0.25 * b * b, 0.25 * climb * climb
         x, y, z = frame.centre.tolist()
         self._centre = (x, y, z)
         self.reset()
@@ -151,8 +157,8 @@ class Multirotor:
         of 2/b of the attitude; so the horizontal velocity is compared with the plan after this lag,
         else it would overshoot.
         """
-        dt, b, gravity = self._dt, self.gains.velocity, self._gravity
-        climb = CLIMB * b
+        dt, gravity = self._dt, self._gravity
+        b, climb, part, gain, gain_z = self._bandwidths
         vx, vy, vz = velocity
         rx, ry, rz = reference
         if self._plan is None:
@@ -162,31 +168,30 @@ class Multirotor:
         ix, iy, iz = self._integral
 
         planned_x, planned_y = b * (rx - ux), b * (ry - uy)
-        planned_x, planned_y = _shorten(planned_x, planned_y, AHEAD * self._ahead_max)
-        planned_z = min(max(climb * (rz - uz), -SINK * gravity), self._rise_max)
+        planned_x, planned_y = _shorten(planned_x, planned_y, self._planned_max)
+        planned_z = min(max(climb * (rz - uz), self._sink_max), self._rise_max)
         ex, ey, ez = lx - vx, ly - vy, uz - vz
         # A robot that cannot follow, as in contact, does not get the whole plan later.
         ahead, aside = _shorten(ux + planned_x * dt - vx, uy + planned_y * dt - vy, self._lead_max)
         above = min(max(uz + planned_z * dt - vz, -self._climb_lead_max), self._climb_lead_max)
         self._plan = (vx + ahead, vy + aside, vz + above)
-        part = 0.5 * self.gains.attitude * dt
         self._lagging = (lx + part * (ux - lx), ly + part * (uy - ly))
 
         # The vertical force has priority; the tilt limit and the largest thrust bound the rest.
         wanted_z = planned_z + climb * ez + iz + gravity
-        up = min(max(wanted_z, THRUST_MIN * gravity), self._thrust_max)
+        up = min(max(wanted_z, self._up_min), self._thrust_max)
         drag = self._drag
         wanted_x = planned_x + drag * ux + b * ex + ix
         wanted_y = planned_y + drag * uy + b * ey + iy
-        left = sqrt(self._thrust_max * self._thrust_max - up * up)
+        left = sqrt(self._thrust_square - up * up)
         ahead, aside = _shorten(wanted_x, wanted_y, min(up * self._slope_max, left))
 
         # A limited force would wind up the integral.
         if up == wanted_z:
-            iz += 0.25 * climb * climb * ez * dt
-            iz = min(max(iz, -WEIGHT * gravity), WEIGHT * gravity)
+            iz += gain_z * ez * dt
+            iz = min(max(iz, -self._heave_max), self._heave_max)
         if ahead == wanted_x and aside == wanted_y:
-            ix, iy = _shorten(ix + 0.25 * b * b * ex * dt, iy + 0.25 * b * b * ey * dt, WIND)
+            ix, iy = _shorten(ix + gain * ex * dt, iy + gain * ey * dt, WIND)
         self._integral = (ix, iy, iz)
         return ahead, aside, up
 
