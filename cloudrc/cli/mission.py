@@ -7,6 +7,7 @@ In a cluster, `run` creates a Kubernetes Job, whose pod posts the mission to the
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sys
@@ -290,10 +291,9 @@ def _follow(
     except KeyboardInterrupt:
         stopped(mission)
         raise
-    text = describe_verdict(verdict)
-    print_line(text)
+    print_line(describe_verdict(verdict))
     ended(mission)
-    leave_message(text)
+    leave_message(json.dumps(verdict))
     return int(verdict["exit_code"])
 
 

@@ -146,7 +146,7 @@ def _descriptor(stream: TextIO) -> int | None:
 
 
 def leave_message(text: str) -> None:
-    """Leave one sentence about the end of this pod, which Kubernetes shows with the pod's state."""
+    """Leave one line about the end of this pod, which Kubernetes keeps with the pod's state."""
     if os.access(TERMINATION_LOG, os.W_OK):
         TERMINATION_LOG.write_text(f"{escape(text)}\n", encoding="utf-8")
 

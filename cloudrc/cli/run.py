@@ -158,7 +158,7 @@ def _advise(report: Mapping[str, Any]) -> None:
 
     codes = [failure["code"] for failure in report["failures"]]
     for robot in report.get("robots", ()):
-        codes += robot.get("why", "").split(", ")
+        codes += robot.get("codes", ())
     if "not_real_time" in codes:
         tell(f"the flight did not keep real time: {ADVICE}, or fly with --mode virtual")
 

@@ -9,7 +9,6 @@ each robot are read once before and once after its mission, five robots a second
 from __future__ import annotations
 
 import csv
-import re
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cluster.client import ClusterError, Release, run
-from cloudrc.cluster.jobs import AT, KILLED_WATCHER, Ended, JobReader
+from cloudrc.cluster.jobs import AT, KILLED_WATCHER, Ended, JobReader, read_end
 from cloudrc.cluster.pods import (
     CELL,
     DATA,
@@ -28,7 +27,7 @@ from cloudrc.cluster.pods import (
     read_page,
     read_samples,
 )
-from cloudrc.errors import CloudrcError, to_one_line
+from cloudrc.errors import CloudrcError
 
 if TYPE_CHECKING:
     from cloudrc.link.cell import Usage
@@ -65,7 +64,7 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
         tell("the robots fly already: ages and HOLD count from now on")
     start = max((each.time_s for each in _read_cell(release)), default=0.0)
     ended = {
-        robot: Ended(ClusterError.exit_code, "INTERRUPTED: no_verdict")
+        robot: Ended(ClusterError.exit_code, "", ("no_verdict",))
         for robot in range(job.spec.completions)
     }
 
@@ -73,8 +72,8 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
         if state.exit_code in KILLED_WATCHER:  # a new pod follows the mission
             return ""
         robot = int(pod.metadata.annotations[ROBOT])
-        ended[robot] = Ended(state.exit_code, to_one_line(state.message) or state.reason)
-        return f"robot {robot}: {ended[robot].message}"
+        ended[robot] = read_end(state)
+        return f"robot {robot}: {ended[robot].message or state.reason}"
 
     for _ in JobReader(release, name, tell, see_end, logs=False).read():
         pass
@@ -89,12 +88,11 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
 
 
 def _verdict(end: Ended) -> dict[str, str]:
-    """Return the verdict of a robot and, after a failure, the codes of its causes."""
+    """Return the verdict of a robot and the codes of its failures."""
     from cloudrc.metrics.verdict import EXIT_CODES
 
     named = {code: verdict for verdict, code in EXIT_CODES.items()}
-    codes = re.findall(r"(?:^[A-Z]+|; also) ?:? (\w+)", end.message) if end.exit_code else []
-    why = {"why": ", ".join(codes)} if codes else {}
+    why = {"why": ", ".join(end.codes)} if end.codes else {}
     return {"verdict": named.get(end.exit_code, "interrupted"), **why}
 
 

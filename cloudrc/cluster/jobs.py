@@ -34,6 +34,7 @@ from cloudrc.cluster.pods import (
 )
 from cloudrc.cluster.releases import COMPONENT as LABEL
 from cloudrc.errors import TimedOutError, to_one_line
+from cloudrc.teleop.client import describe_verdict
 
 COMPONENT = "mission"
 """Label `component` of the Jobs, pods and ConfigMaps of missions, and name of their container."""
@@ -77,6 +78,23 @@ class Ended(NamedTuple):
 
     exit_code: int  # of the container
     message: str  # verdict in words, or why the Job failed
+    codes: tuple[str, ...] = ()  # of the verdict's failures
+
+
+def read_end(state: Any) -> Ended:
+    """Return how the container of a mission ended; `state` is its state `terminated`.
+
+    It leaves its verdict as JSON, as the API's model `Verdict`. Without a verdict, Kubernetes has
+    the last lines of its log.
+    """
+    from cloudrc.teleop.models import Verdict
+
+    try:
+        verdict = Verdict.model_validate_json(state.message or "")
+    except ValueError:
+        return Ended(state.exit_code, to_one_line(state.message))
+    codes = tuple(failure.code for failure in verdict.failures)
+    return Ended(state.exit_code, to_one_line(describe_verdict(verdict.model_dump())), codes)
 
 
 def run_job(
@@ -237,7 +255,8 @@ def follow(release: Release, name: str, write: Callable[[str], None]) -> Ended:
     cause = failure_of(reader.job) or ""
     if not states or states[-1].exit_code in KILLED_WATCHER:
         raise JobGoneError(f"its Job has ended without a verdict: {cause}", reader.key)
-    return Ended(states[-1].exit_code, to_one_line(states[-1].message) or cause)
+    ended = read_end(states[-1])
+    return ended._replace(message=ended.message or cause)
 
 
 class JobReader:

@@ -253,4 +253,5 @@ class Recorder:
             f"{self._path}: {reason}; make room or choose another folder; the flight goes on"
         )
         if self._sink:
-            self._unwritten += self._sink.abandon(reason)
+            code = "disk_full" if error.errno in DISK_FULL else ""
+            self._unwritten += self._sink.abandon(reason, code)

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from cloudrc.errors import DISK_FULL, DiskFullError
+from cloudrc.errors import DiskFullError
 from cloudrc.messages import Cause, GuardState, Vector
 from cloudrc.metrics.counters import growth
 from cloudrc.metrics.definitions import real_time_factor
@@ -40,6 +40,7 @@ from cloudrc.metrics.mission import (
     unconfirmed,
 )
 from cloudrc.metrics.response import responses
+from cloudrc.record import STOPPED
 from cloudrc.record.columns import Recording
 from cloudrc.record.holes import describe
 from cloudrc.records import CONTROLLER_LOST, REAL_TIME_FACTOR_MIN
@@ -267,7 +268,7 @@ def _ending(flight: Flight, interrupted: bool) -> Ending:
     for code, text in rows_of(flight.recording["/fault"], "code", "text"):
         if code in CONTROLLER_LOST:  # the runner ends a flight with this fault
             return Ending(code, text)
-    if any(words in flight.recording.note for words in DISK_FULL.values()):
+    if flight.recording.note and flight.recording.metadata.get(STOPPED) == "disk_full":
         text = f"the recording is cut off ({flight.recording.note}); free some space"
         return Ending("disk_full", text)
     if interrupted:

@@ -14,6 +14,8 @@ from pathlib import Path
 WALL_OFFSET = "wall_clock_offset_ns"
 """Metadata key, only in real time: wall time minus the stamps' clock at the opening of the file
 [ns]."""
+STOPPED = "stopped"
+"""Metadata key: the failure code of what stopped the recorder, such as disk_full."""
 
 
 def part_before(path: Path) -> Path:

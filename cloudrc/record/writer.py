@@ -26,7 +26,7 @@ from mcap.records import DataEnd, Footer, Metadata
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 
 from cloudrc.files import atomic_file, open_file, try_lock
-from cloudrc.record import WALL_OFFSET, wall_time
+from cloudrc.record import STOPPED, WALL_OFFSET, wall_time
 from cloudrc.record.content import Content
 from cloudrc.record.holes import HOLES, Hole, to_metadata
 from cloudrc.record.ros import definition, encode, type_hash
@@ -174,14 +174,16 @@ class McapWriter:
                 if error.errno != errno.EINVAL:  # EINVAL: a pipe or device, which has no sync
                     raise
 
-    def abandon(self, reason: str) -> int:
+    def abandon(self, reason: str, code: str = "") -> int:
         """After an error, cut off the incomplete end of the file; if possible, note the reason.
 
+        `code` is the failure code of the reason; "" if no code names it.
         Return the number of records that were passed to `write` but are not in the file.
         """
         note: Any = RecordBuilder()  # without type annotations
         end: Any = RecordBuilder()
-        Metadata(METADATA, {MISSING: reason}).write(note)
+        named = {STOPPED: code} if code else {}
+        Metadata(METADATA, {MISSING: reason, **named}).write(note)
         DataEnd(0).write(end)
         Footer(0, 0, 0).write(end)
         first = b"" if self._whole else MCAP0_MAGIC
@@ -244,7 +246,8 @@ def write(content: Content, target: Path, attachments: Mapping[str, bytes]) -> N
     """
     messages = content.messages
     # What the source missed is in the note, unless the content was cut to another time.
-    metadata = {k: v for k, v in content.metadata.items() if k not in (MISSING, HOLES)}
+    left_out = (MISSING, HOLES) if content.note else (MISSING, HOLES, STOPPED)
+    metadata = {k: v for k, v in content.metadata.items() if k not in left_out}
     clock, machine = metadata.get(CLOCK, ""), metadata.get("clock_id", "")
     with atomic_file(target) as file, McapWriter(file, clock=clock, clock_id=machine) as writer:
         missing = {MISSING: content.note} | to_metadata(content.holes) if content.note else {}

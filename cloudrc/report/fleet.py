@@ -106,7 +106,7 @@ class FleetFlown:
         known = {name: each["value"] for name, each in document["numbers"].items()}
         row = {"robot": number, "verdict": document["verdict"]}
         if codes := [failure["code"] for failure in document["failures"]]:
-            row["why"] = ", ".join(codes)
+            row |= {"codes": codes, "why": ", ".join(codes)}
         for name, (own, factor) in NUMBERS.items():
             if own in known:
                 row[name] = known[own] * factor

@@ -24,6 +24,7 @@ waypoints:
   - {position_m: [2.0, 0.0, 1.0], dwell_s: 0.0}
 """
 SUCCESS = {"outcome": "success", "exit_code": 0, "failures": []}
+CANCELLED = [{"code": "cancelled", "text": "mission cancelled"}]
 
 
 @pytest.fixture
@@ -91,7 +92,8 @@ def test_fly_under_one_key_flies_once_and_leaves_its_verdict(api, mission, folde
     end.start()
     for _ in range(2):
         assert "INTERRUPTED" in mission("fly --mission two.yaml --key uid", 130).out
-        assert log.read_text() == "INTERRUPTED: cancelled: mission cancelled\n"
+        left = json.loads(log.read_text())
+        assert left == {"outcome": "interrupted", "exit_code": 130, "failures": CANCELLED}
     end.join()
     assert len(api.get("/v1/missions")["missions"]) == 1
 

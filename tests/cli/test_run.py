@@ -105,10 +105,11 @@ def test_a_report_that_cannot_be_written_can_be_later(fails, error, code, said, 
 
 
 @pytest.mark.usefixtures("no_page")
-def test_a_flight_that_did_not_keep_real_time_ends_with_what_to_do(monkeypatch, call):
+@pytest.mark.parametrize("more", [(), ("--set", "fleet.robots=2")])
+def test_a_flight_that_did_not_keep_real_time_ends_with_what_to_do(more, monkeypatch, call):
     slow = FlightVerdict("invalid", (FlightFailure("not_real_time", "it was too slow"),))
     monkeypatch.setattr("cloudrc.report.write.judge", lambda evidence: slow)
-    said = call(*FLY, code=6)
+    said = call(*FLY, *more, code=6)
     assert said.out.splitlines()[-1].endswith("report.html")
     assert said.err.splitlines()[-1].endswith("or fly with --mode virtual")
 

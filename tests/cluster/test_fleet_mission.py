@@ -2,6 +2,7 @@
 
 """Missions of a fleet on the fake API server: one Job, one watch, one summary."""
 
+import json
 from itertools import cycle
 
 import pytest
@@ -9,11 +10,14 @@ import pytest
 from cloudrc.cluster import fleet_mission, jobs
 from cloudrc.cluster.fleet_mission import follow_fleet
 from cloudrc.cluster.jobs import run_job
+from cloudrc.teleop.client import ALL_MET
 from tests.cluster.conftest import MISSION
 
 HEAD = "time_s,direction,packets,size,busy_ns,waited_ns,longest_ns,most,dropped,dropped_by\n"
 BEFORE = "0.1,uplink,9,90,90000000,0,0,1,0,\n"
 ROW = "uplink,10,100,100000000,900000000,99000000,50,6,1:4 2:2"
+TEXTS = {"timed_out": "too late; also no_code: 1", "not_settled": "1 m"}
+FAILURES = [{"code": code, "text": text} for code, text in TEXTS.items()]
 FLIGHT = "".join(f"0.{tenth},{ROW}\n" for tenth in range(2, 10))
 
 
@@ -39,8 +43,9 @@ cloudrc_guard_held_seconds_total {age / 10}
         name = run_job(release, MISSION)
         for robot in range(robots):
             code = int(robot == 1)
-            message = "FAILURE: timed_out: too late; also not_settled: 1 m" if code else "SUCCESS"
-            api.end_robot(name, robot, code, message)
+            verdict = {"outcome": "failure" if code else "success", "exit_code": code}
+            failures = FAILURES if code else []
+            api.end_robot(name, robot, code, json.dumps({**verdict, "failures": failures}))
         api.end(name, "Complete")
         api.seen.clear()
         return lines, follow_fleet(release, name, lines.append), list(api.seen)
@@ -52,9 +57,9 @@ def test_a_fleet_ends_with_a_verdict_per_robot_and_a_summary_that_names_the_cell
     lines, ended, _ = flown(3)
     assert ended.exit_code == 1
     assert lines[1:4] == [
-        "robot 0: SUCCESS",
-        "robot 1: FAILURE: timed_out: too late; also not_settled: 1 m",
-        "robot 2: SUCCESS",
+        f"robot 0: SUCCESS: {ALL_MET}",
+        "robot 1: FAILURE: timed_out: too late; also no_code: 1; also not_settled: 1 m",
+        f"robot 2: SUCCESS: {ALL_MET}",
     ]
     summary = "\n".join(lines)
     assert "FAILURE: 1 of 3 robots did not succeed: robot 1 (timed_out, not_settled)" in summary

@@ -88,6 +88,7 @@ def test_on_a_full_disk_all_is_kept_or_counted(tmp_path, room):
         kept = len(recording["/count"])
         assert recording.unread == 0, "the file ends with a whole chunk"
         noted = "disk full" in recording.note
+        assert noted == (recording.metadata.get("stopped") == "disk_full")
         assert noted or room - path.stat().st_size < 200, "noted, if there is room for a note"
     assert kept + recorder.dropped == len(records)
     assert kept < len(records)

@@ -200,7 +200,7 @@ class Shelf:
     def note_losses(self, text, holes):
         self.lost = text, list(holes)
 
-    def abandon(self, reason):
+    def abandon(self, reason, code):
         self.closed = True
         return 0
 
