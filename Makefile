@@ -209,12 +209,14 @@ $(EVIDENCE)/delayed-cartpole.md:
 	build/sb3/bin/pip install --quiet '.[gym]' stable-baselines3
 	build/sb3/bin/python examples/delayed_cartpole.py > $@
 
-# Beside, not in the environment: a clone keeps its viser.
+# Beside, not in the environment: a clone keeps its versions.
+CONSOLE_PACKAGES = viser uvicorn websockets
 CONSOLE_TESTS = tests/console tests/report/test_replay.py tests/report/test_scene.py -m 'not full'
-viser: $(VENV)/dev ## test console and replay on the locked viser, and on the newest one
-	for viser in "$$(grep -o '^viser==[0-9.]*' tests/requirements.txt)" viser; do \
-		rm -rf build/viser && $(bin)/python -m pip install --quiet --no-deps --target build/viser "$$viser" \
-		&& ls -d build/viser/viser-*.dist-info && PYTHONPATH=build/viser $(bin)/pytest $(CONSOLE_TESTS) || exit 1; done
+viser: $(VENV)/dev ## test console and replay on the locked viser and web servers, and on the newest ones
+	locked="$$(for name in $(CONSOLE_PACKAGES); do grep -o "^$$name==[0-9.]*" tests/requirements.txt; done)"; \
+	for packages in "$$locked" "$(CONSOLE_PACKAGES)"; do \
+		rm -rf build/viser && $(bin)/python -m pip install --quiet --no-deps --target build/viser $$packages \
+		&& ls -d build/viser/*.dist-info && PYTHONPATH=build/viser $(bin)/pytest $(CONSOLE_TESTS) || exit 1; done
 
 .PHONY: night-tun night-ros2 night-netem
 night-tun:

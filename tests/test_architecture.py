@@ -112,6 +112,41 @@ def test_no_file_and_no_function_is_too_long():
     assert long == set()
 
 
+PUBLIC = {"_asdict", "_fields", "_replace", "_exit"}
+"""Names that Python documents for everybody."""
+NO_OTHER_NAME = {"_address", "_add_info", "_Writer__chunk_indices"}
+"""Of mujoco, gymnasium and mcap, which have no public name for it."""
+
+
+def private_of_others(parsed):
+    """Return the private names that no file of the package gives to anything, and imported ones."""
+    used, own = set(), set()
+    for node in (node for tree in parsed for node in ast.walk(tree)):
+        match node:
+            case ast.Attribute(attr=name, ctx=ast.Load()):
+                used.add(name)
+            case ast.ImportFrom(module=module, names=names) if not module.startswith("cloudrc"):
+                used |= {part for part in module.split(".") if part != "__future__"}
+                used |= {alias.name for alias in names}
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name):
+                own.add(name)
+            case ast.ClassDef(name=name, body=body):
+                own.add(name)
+                own |= {each.target.id for each in body if isinstance(each, ast.AnnAssign)}
+                sets = (each.targets for each in body if isinstance(each, ast.Assign))
+                own |= {one.id for each in sets for one in each if isinstance(one, ast.Name)}
+            case ast.Attribute(attr=name, ctx=ast.Store()):
+                own.add(name)
+    return {name for name in used - own if name.startswith("_") and not name.endswith("_")}
+
+
+def test_no_private_name_of_another_package_is_used():
+    assert private_of_others(trees().values()) - PUBLIC - NO_OTHER_NAME == set()
+    for text in ("chart._queue_update(1)", "import a\na._b", "from a._b import c", "x.y._z"):
+        assert private_of_others([ast.parse(text)]), text
+    assert private_of_others([ast.parse("def f(self):\n    self._a = 1\n    self._a")]) == set()
+
+
 def test_no_two_public_classes_share_a_name():
     found = Counter(
         node.name

@@ -50,9 +50,8 @@ def execute(options: Options) -> None:
 
 
 def _actions(parser: Parser) -> Iterator[argparse.Action]:
-    for action in parser._actions:
-        yield action
-        if isinstance(action, argparse._SubParsersAction):
-            action.help = "what to do"  # without it, shtab leaves the commands out
-            for command in action.choices.values():
-                yield from _actions(command)
+    yield from parser.declared
+    if parser.verbs:
+        parser.declared[-1].help = "what to do"  # without it, shtab leaves the commands out
+        for command in parser.verbs.values():
+            yield from _actions(command)

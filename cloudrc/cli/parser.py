@@ -12,7 +12,7 @@ from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn, Protocol, TypeVar
 
 from cloudrc.errors import BadInputError
 from cloudrc.outside.values import InvalidValueError, Quantity
@@ -106,11 +106,26 @@ PATHS = ("FILE", "DIR", "FOLDER", "RUN", "RUN|RELEASE")
 """Names of values that are paths."""
 
 
+class Arguments(Protocol):
+    """What takes arguments: a parser, or a group of its arguments."""
+
+    def add_argument(self, *names: str, **given: Any) -> argparse.Action:
+        """Declare an argument."""
+        ...
+
+
 class Parser(argparse.ArgumentParser):
-    """Parse a command line; raise errors as BadInputError, which `main` prints in one line."""
+    """Parse a command line; raise errors as BadInputError, which `main` prints in one line.
+
+    Attributes:
+        declared: The arguments, also those of groups.
+        verbs: Verb, or command, -> its parser.
+    """
 
     def __init__(self, **given: Any) -> None:
         """Take the arguments of argparse; declare `--debug`, which every command and verb has."""
+        self.declared: list[argparse.Action] = []
+        self.verbs: Mapping[str, Parser] = {}
         super().__init__(formatter_class=_formatter, allow_abbrev=False, **given)
         about = "show the traceback of an error"
         self.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=about)
@@ -119,20 +134,49 @@ class Parser(argparse.ArgumentParser):
         """Raise an error with the message of argparse and the command that prints the help."""
         raise BadInputError(f"{message}; see '{self.prog} --help'")
 
+    def add_argument(self, *names: Any, **given: Any) -> argparse.Action:
+        """Declare an argument."""
+        self.declared.append(super().add_argument(*names, **given))
+        return self.declared[-1]
+
+    def add_argument_group(self, *about: Any, **given: Any) -> Any:
+        """Begin a group of arguments."""
+        return self._noted(super().add_argument_group(*about, **given))
+
+    def add_mutually_exclusive_group(self, **given: Any) -> Any:
+        """Begin a group of arguments that exclude each other."""
+        return self._noted(super().add_mutually_exclusive_group(**given))
+
+    def _noted(self, group: Any) -> Any:
+        """Let `declared` have the arguments of a group, too."""
+        declare = group.add_argument
+
+        def add_argument(*names: str, **given: Any) -> argparse.Action:
+            self.declared.append(declare(*names, **given))
+            return self.declared[-1]
+
+        group.add_argument = add_argument
+        return group
+
+    def add_subparsers(self, **given: Any) -> Any:
+        """Begin the verbs, or the commands."""
+        action: Any = super().add_subparsers(**given)
+        self.declared.append(action)
+        self.verbs = action.choices
+        return action
+
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Refuse unknown arguments here: argparse would name the help of the first command."""
+        first = next((word for word in args or () if word != "--debug"), "-")
+        if self.verbs and not first.startswith("-") and first not in self.verbs:
+            text = unknown_name_text("choice", first, [*self.verbs])
+            self.error(str(argparse.ArgumentError(self.declared[-1], text)))
         known, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            hint = suggest_name(unknown[0], [*self._option_string_actions])
+            names = [name for action in self.declared for name in action.option_strings]
+            hint = suggest_name(unknown[0], names)
             self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         return known, unknown
-
-    def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Refuse an unknown choice, and suggest the most similar one."""
-        if action.choices is not None and value not in action.choices:
-            raise argparse.ArgumentError(
-                action, unknown_name_text("choice", value, [*action.choices])
-            )
 
 
 @dataclass(frozen=True)
@@ -177,7 +221,7 @@ def read_size(text: str) -> float:
     return float(number) * (1024.0 if binary else 1000.0) ** power
 
 
-def flags(parser: argparse._ActionsContainer) -> Add:
+def flags(parser: Arguments) -> Add:
     """Return a function that declares an argument: `add(name, value, text, default, read)`.
 
     A `name` may be two, such as "-n --namespace". `value` names the value in the help: with "" the
@@ -189,7 +233,7 @@ def flags(parser: argparse._ActionsContainer) -> Add:
 
 
 def _declare(
-    parser: argparse._ActionsContainer,
+    parser: Arguments,
     name: str,
     value: str | None,
     text: str,
@@ -203,10 +247,23 @@ def _declare(
         return parser.add_argument(*name.split(), action="store_true", help=text)
     if many or value == "KEY=VALUE":
         others["action"], default = "append", []
+    if "choices" in others:
+        read = _one_of([*others["choices"]])
     read = read or (Path if value in PATHS else None)
     return parser.add_argument(
         *name.split(), metavar=value, help=text, default=default, type=read, **others
     )
+
+
+def _one_of(choices: list[str]) -> Callable[[str], str]:
+    """Return a type for argparse: a choice; it suggests the most similar one for another text."""
+
+    def read(text: str) -> str:
+        if text not in choices:
+            raise argparse.ArgumentTypeError(unknown_name_text("choice", text, choices))
+        return text
+
+    return read
 
 
 def figure_arguments(parser: Parser, width: float) -> None:

@@ -8,7 +8,15 @@ import argparse
 import socket
 from types import SimpleNamespace
 
-from cloudrc.cli.parser import Options, Parser, flags, read_size, settings_from, whole_number
+from cloudrc.cli.parser import (
+    Arguments,
+    Options,
+    Parser,
+    flags,
+    read_size,
+    settings_from,
+    whole_number,
+)
 from cloudrc.drivers.process import StopSignal
 from cloudrc.drivers.realtime import Address, split_address
 
@@ -19,7 +27,7 @@ def process_arguments(parser: Parser) -> None:
     number_argument(parser)
 
 
-def number_argument(parser: argparse._ActionsContainer) -> None:
+def number_argument(parser: Arguments) -> None:
     """Declare the flag of processes that work for one robot of a fleet."""
     about = "number in the experiment's fleet (default: no fleet)"
     flags(parser)("--robot", "K", about, read=whole_number(0, 999))

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -23,7 +22,7 @@ from cloudrc.cli.output import (
     tell,
     warn,
 )
-from cloudrc.cli.parser import Options, Parser, flags, read_count, read_seed
+from cloudrc.cli.parser import Arguments, Options, Parser, flags, read_count, read_seed
 from cloudrc.cli.report import print_traceback, report_arguments, summary
 from cloudrc.cli.where import (
     DEFAULT_RELEASE,
@@ -82,7 +81,7 @@ def arguments(parser: Parser) -> None:
     timeout_argument(parser)
 
 
-def experiment_arguments(parser: Parser, seed: argparse._ActionsContainer) -> None:
+def experiment_arguments(parser: Parser, seed: Arguments) -> None:
     """Declare the arguments that choose an experiment, with `--seed` in the group `seed`."""
     add = flags(parser)
     about = "name of a shipped experiment, or a YAML file (default: paper)"

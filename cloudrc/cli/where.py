@@ -17,7 +17,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import tell
-from cloudrc.cli.parser import KUBECTL_PLUGIN, Add, Options, Parser, flags, number, whole_number
+from cloudrc.cli.parser import (
+    KUBECTL_PLUGIN,
+    Add,
+    Arguments,
+    Options,
+    Parser,
+    flags,
+    number,
+    whole_number,
+)
 from cloudrc.cluster.client import DEFAULT_RELEASE as DEFAULT_RELEASE
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.files import warn_if_readable
@@ -127,7 +136,7 @@ def need_release(options: Options) -> Release:
         raise MissingPrerequisiteError(f"{text}; and {error}") from None
 
 
-def api_arguments(parser: argparse._ActionsContainer, text: str, *, required: bool = False) -> None:
+def api_arguments(parser: Arguments, text: str, *, required: bool = False) -> None:
     """Declare --api, the address of teleop's API, and --token-file."""
     add = flags(parser)
     add("--api", "URL", text, read=_api, required=required)

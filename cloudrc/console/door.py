@@ -14,7 +14,7 @@ import json
 import socket
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
-from functools import partial
+from http import HTTPStatus
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -54,6 +54,7 @@ FOREIGN = (
     "This address is not the console's own. If a proxy of yours serves it, "
     "start the console with --allow-origin and this origin."
 )
+END_OF_HEAD = b"\r\n\r\n"
 HEADERS = [
     ("Cache-Control", "no-store"),
     ("Referrer-Policy", "no-referrer"),
@@ -65,31 +66,28 @@ WEB = Path(__file__).parent / "web"
 """Folder of the pages' parts."""
 
 
-class _Protocol(H11Protocol):
-    """HTTP of a browser, which has to send its first request within `HEAD_TIME`."""
+class _FirstHead(asyncio.Protocol):
+    """Pass a new connection on to uvicorn; end it if its first request takes over `HEAD_TIME`."""
 
-    def __init__(self, door: Door, **settings: Any) -> None:
-        super().__init__(**settings)
-        self._door = door
+    def __init__(self, **settings: Any) -> None:
+        self._http = H11Protocol(**settings)
+        self._head = b""
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        self.loop.call_later(HEAD_TIME, self._end_if_silent)
+    def connection_made(self, transport: Any) -> None:
+        self._transport = transport
+        self._end = asyncio.get_running_loop().call_later(HEAD_TIME, transport.abort)
+        self._http.connection_made(transport)
 
-    def _end_if_silent(self) -> None:
-        request: object = self.cycle
-        if request is None and self.transport.get_protocol() is self:
-            self.transport.abort()
+    def data_received(self, data: bytes) -> None:
+        self._head += data  # uvicorn ends a connection with more than `HEAD_MAX`
+        if END_OF_HEAD in self._head:
+            self._end.cancel()
+            self._transport.set_protocol(self._http)
+        self._http.data_received(data)
 
-    def _should_upgrade(self) -> bool:
-        return self._door.gives_scene_to(HTTPConnection(dict(self.scope)))
-
-    def handle_websocket_upgrade(self, event: Any) -> None:
-        """Pass the connection on to viser, with the head of its request."""
-        self.connections.discard(self)
-        lines = [b"%b %b HTTP/1.1" % (event.method, event.target)]
-        lines += [b"%b: %b" % header for header in event.headers]
-        self._passing = self._door.pass_on(self.transport, b"\r\n".join([*lines, b"", b""]))
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._end.cancel()
+        self._http.connection_lost(exc)
 
 
 class Door(ThreadServer):
@@ -120,7 +118,8 @@ class Door(ThreadServer):
         super().__init__(
             self._check,
             opened,
-            partial(_Protocol, self),
+            _FirstHead,
+            self._web_socket,
             headers=HEADERS,
             h11_max_incomplete_event_size=HEAD_MAX,
         )
@@ -143,8 +142,6 @@ class Door(ThreadServer):
 
     async def _show(self, request: Request) -> Response:
         name = request.path_params["name"]
-        if "upgrade" in request.headers:
-            return Response(status_code=503)  # no place for one more scene
         if PARAMETER in request.query_params:
             return self._keep_token(request)
         if name == "state":
@@ -187,37 +184,59 @@ class Door(ThreadServer):
         answer = await run_in_threadpool(act)
         return PlainTextResponse(answer.words)
 
-    def gives_scene_to(self, request: HTTPConnection) -> bool:
-        """Return whether viser may serve a request: an admitted page opens its WebSocket."""
-        asked = request.scope["method"], request.headers.get("upgrade", "").lower()
-        is_free = self._open < PAGES_MAX
-        return asked == ("GET", "websocket") and is_free and self._refusal(request) is None
+    def _web_socket(self, **_: Any) -> asyncio.StreamReaderProtocol:
+        """Take a connection over from uvicorn, which writes the head of its request again."""
+        return asyncio.StreamReaderProtocol(asyncio.StreamReader(), self._serve_scene)
 
-    def pass_on(self, page: asyncio.Transport, head: bytes) -> asyncio.Task[None]:
-        """Let viser serve the connection of a page from now on; `head` begins its request."""
-        loop = asyncio.get_running_loop()
-        reader = asyncio.StreamReader()
-        protocol = asyncio.StreamReaderProtocol(reader)
-        protocol.connection_made(page)
-        page.set_protocol(protocol)
-        self._open += 1
-        return loop.create_task(
-            self._pass_on(reader, asyncio.StreamWriter(page, protocol, reader, loop), head)
-        )
+    async def _serve_scene(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        """Let viser serve the WebSocket of an admitted page, and turn any other one away."""
+        with suppress(OSError), closing(writer):
+            head = await reader.readuntil(END_OF_HEAD)
+            answer = self._refusal(_read_head(head))
+            if answer is None and self._open >= PAGES_MAX:
+                answer = Response(status_code=503)
+            if answer is not None:
+                writer.write(_as_bytes(answer))
+                return
+            self._open += 1
+            try:
+                await self._pass_on(reader, writer, head)
+            finally:
+                self._open -= 1
 
     async def _pass_on(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, head: bytes
     ) -> None:
-        with suppress(OSError), closing(writer):
-            from_viser, to_viser = await asyncio.open_unix_connection(self.viser)
-            with closing(to_viser):
-                to_viser.write(head)
-                ways = _copy(reader, to_viser), _copy(from_viser, writer)
-                tasks = [asyncio.create_task(way) for way in ways]
-                await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-                for task in tasks:
-                    task.cancel()
-        self._open -= 1
+        """Connect a page with viser until one of them ends; `head` begins the page's request."""
+        from_viser, to_viser = await asyncio.open_unix_connection(self.viser)
+        with closing(to_viser):
+            to_viser.write(head)
+            ways = _copy(reader, to_viser), _copy(from_viser, writer)
+            tasks = [asyncio.create_task(way) for way in ways]
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in tasks:
+                task.cancel()
+
+
+def _read_head(head: bytes) -> HTTPConnection:
+    """Read the head of a request that uvicorn has checked."""
+    first, *lines = head.removesuffix(END_OF_HEAD).split(b"\r\n")
+    _, target, _ = first.split(b" ")
+    pairs = (line.partition(b":") for line in lines)
+    headers = [(name.lower(), value.strip(b" ")) for name, _, value in pairs]
+    query = target.partition(b"?")[2]
+    return HTTPConnection({"type": "websocket", "headers": headers, "query_string": query})
+
+
+def _as_bytes(answer: Response) -> bytes:
+    """Return an answer with which the connection ends, as HTTP."""
+    first = f"HTTP/1.1 {answer.status_code} {HTTPStatus(answer.status_code).phrase}"
+    own = [(name.encode(), value.encode()) for name, value in HEADERS]
+    pairs = [*own, *answer.raw_headers, (b"Connection", b"close")]
+    head = [first.encode(), *(b"%b: %b" % pair for pair in pairs)]
+    return b"\r\n".join(head) + END_OF_HEAD + bytes(answer.body)
 
 
 async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

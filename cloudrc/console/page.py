@@ -148,8 +148,8 @@ class Page:
         columns = feed.columns()
         for chart, (factor, _, curves) in zip(self._charts, CHARTS.values(), strict=True):
             rows = [_with_gaps(columns[place] * factor) for place, _ in curves.values()]
-            # Not chart.data: it would make numbers of the values that are unknown.
-            chart._queue_update("data", (columns[0], *rows))
+            # A list: viser makes numbers of the unknown values of a tuple.
+            chart.data = [columns[0], *rows]
         if feed.flown != self._drawn:
             self._drawn = feed.flown
             scene.set_trail(*feed.trail())

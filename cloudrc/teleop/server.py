@@ -17,13 +17,23 @@ STOP_LIMIT = 1
 class ThreadServer(uvicorn.Server):
     """Serves in a separate thread, from `start` to `stop`."""
 
-    def __init__(self, app: Any, opened: socket.socket, http: Any = "h11", **settings: Any) -> None:
-        """Serve the ASGI application `app` at the socket `opened`."""
+    def __init__(
+        self,
+        app: Any,
+        opened: socket.socket,
+        http: Any = "h11",
+        ws: Any = "none",
+        **settings: Any,
+    ) -> None:
+        """Serve the ASGI application `app` at the socket `opened`.
+
+        `http` and `ws` are uvicorn's settings: protocols for requests and for WebSockets.
+        """
         super().__init__(
             uvicorn.Config(
                 app,
                 http=http,
-                ws="none",
+                ws=ws,
                 interface="asgi3",
                 lifespan="off",
                 log_level="critical",  # a flood does not fill the log

@@ -5,6 +5,7 @@
 import io
 import time
 from contextlib import ExitStack
+from math import nan
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from tests.console.conftest import (
     in_pod,
     session_with_console,
     start,
+    status,
 )
 
 
@@ -234,6 +236,17 @@ def test_controls_of_a_browser_that_left_do_not_end_the_console(filled):
     slider.remove()
     steering.conditions = {"uplink.delay_ms": 70.0}
     page.update(2.0)
+
+
+def test_what_is_unknown_is_a_gap_in_its_chart(filled):
+    page, feed, _ = filled("hover")
+    for number, delay in enumerate((0.03, 0.03, 0.03, nan, nan, nan, 0.06)):
+        feed.take(status(0.1 * number, uplink_delay=delay), 1.0 + number)
+    page.update(8.0)
+    times, up, down, _ = page._charts[0].data
+    assert times.tolist() == [-6.0, -3.0, 0.0]
+    assert up == [pytest.approx(30.0), None, pytest.approx(60.0)]
+    assert down == [-1.0, None, None], "the axes are drawn if there is a number"
 
 
 @pytest.mark.parametrize(("name", "axes"), [("hover", 3), ("pillars", 2)])
