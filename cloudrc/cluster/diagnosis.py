@@ -18,6 +18,7 @@ from cloudrc.cluster.pods import (
     pod_failure,
 )
 from cloudrc.errors import to_one_line
+from cloudrc.outside.prometheus import Metrics, total
 
 MISSING = ("not found", "non-existent")
 """Words of Kubernetes about a volume, such as a Secret, that somebody has to make."""
@@ -53,6 +54,8 @@ PERIODS_MIN = 5
 """Smallest number of these periods from which the share is computed."""
 READY = "cloudrc_ready"
 """Metric: whether an end hears the other end."""
+DATAGRAMS = "cloudrc_datagrams_total"
+"""Metric: the datagrams of an end by outcome."""
 KEY = "secret"
 """Name of the volume with the key of the tunnel."""
 UPLINK, DOWNLINK = ("world", "cloud", "uplink"), ("cloud", "world", "downlink")
@@ -88,9 +91,7 @@ class Objects(NamedTuple):
         return [to_one_line(each.message) for each in found if each.reason == reason]
 
 
-Page = Mapping[str, float]
-"""Metrics of a container: the sample's name with its labels, as in Prometheus' format -> value."""
-Pages = Mapping[tuple[str, str], Page]
+Pages = Mapping[tuple[str, str], Metrics]
 """Component and container -> its metrics; of one robot."""
 
 
@@ -226,9 +227,9 @@ def is_suspicious(pages: Pages) -> bool:
     An end is ready if it hears the other end.
     """
     for (_, container), page in pages.items():
-        deaf = container in COMPONENTS and not page.get(READY)
+        deaf = container in COMPONENTS and not total(page, READY)
         is_stopped = _throttled({}, page) > LOOK_AGAIN
-        if deaf or page.get("cloudrc_dns_errors_total") or is_stopped:
+        if deaf or total(page, "cloudrc_dns_errors_total") or is_stopped:
             return True
     return False
 
@@ -253,7 +254,7 @@ def _network_tells(
         place[0]
         for place, counts in grown.items()
         # Forged datagrams do not pass, either, but do not silence the other end.
-        if _sum(counts, "cloudrc_datagrams_total", 'outcome="tag"') and not after[place][READY]
+        if total(counts, DATAGRAMS, outcome="tag") and not total(after[place], READY)
     ]:
         text = f"the {' and the '.join(deaf)} pod rejects what arrives: the other end has"
         yield Finding("key", "missing", f"{text} another key", _same_key(release, objects))
@@ -290,29 +291,25 @@ def _blocked(
     """Yield that the network drops what one end sends: nothing at all arrives at the other end."""
     if not {(sender, sender), (receiver, receiver)} <= grown.keys():
         return
-    name, link = "cloudrc_datagrams_total", grown.get((sender, "link"), {})
-    relayed = [value for key, value in link.items() if 'outcome="forwarded"' in key]
+    link = grown.get((sender, "link"), {})
+    relayed = [count for series, count in link.items() if ("outcome", "forwarded") in series.labels]
     # Without a relay, of netem or in a fleet, the end itself has sent it.
-    sent = sum(relayed) if relayed else _sum(grown[sender, sender], name, 'outcome="sent"')
-    heard = _sum(grown[receiver, receiver], name, f'direction="{direction}"')
+    sent = sum(relayed) if relayed else total(grown[sender, sender], DATAGRAMS, outcome="sent")
+    heard = total(grown[receiver, receiver], DATAGRAMS, direction=direction)
     if sent and not heard:
         text = f"UDP from the {sender} pod does not arrive at the {receiver} pod, port 7400"
         fix = f"allow it: {release.kubectl} get networkpolicies; is the other pod's node reached?"
         yield Finding("network", "missing", f"{text} ({direction})", fix)
 
 
-def _growth(before: Page, after: Page) -> Page:
+def _growth(before: Metrics, after: Metrics) -> Metrics:
     """Return by how much each counter has grown; that of a container that began anew began at 0."""
     old = {key: before.get(key, 0.0) for key in after}
     return {key: value - old[key] * (value >= old[key]) for key, value in after.items()}
 
 
-def _sum(page: Page, name: str, label: str) -> float:
-    return sum(value for key, value in page.items() if key.startswith(f"{name}{{") and label in key)
-
-
-def _throttled(before: Page, after: Page) -> float:
+def _throttled(before: Metrics, after: Metrics) -> float:
     """Return the share of the scheduler's periods that the CPU limit has cut short [1]."""
     grown = _growth(before, after)
-    periods = grown.get("cloudrc_cpu_periods_total", 0.0)
-    return grown.get("cloudrc_cpu_throttled_periods_total", 0.0) / max(periods, PERIODS_MIN)
+    periods = total(grown, "cloudrc_cpu_periods_total")
+    return total(grown, "cloudrc_cpu_throttled_periods_total") / max(periods, PERIODS_MIN)

@@ -25,9 +25,9 @@ from cloudrc.cluster.pods import (
     find_pod,
     list_pods,
     read_page,
-    read_samples,
 )
 from cloudrc.errors import CloudrcError
+from cloudrc.outside.prometheus import Metrics, read_metrics, total
 
 if TYPE_CHECKING:
     from cloudrc.link.cell import Usage
@@ -42,7 +42,6 @@ COUNTERS = (
     "cloudrc_guard_held_seconds_total",
 )
 """Counters of world: ages of all commands [s], number of commands, time in HOLD [s]."""
-Metrics = dict[str, float]
 
 
 def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> Ended:
@@ -100,7 +99,7 @@ def _flown(before: Metrics, after: Metrics) -> dict[str, float]:
     """Return the numbers of a robot's mission from its counters before and after it."""
     if not (before and after):
         return {}
-    ages, count, held = (after.get(name, 0.0) - before.get(name, 0.0) for name in COUNTERS)
+    ages, count, held = (total(after, name) - total(before, name) for name in COUNTERS)
     return {"hold_s": held, **({"age_ms": ages / count * 1e3} if count > 0 else {})}
 
 
@@ -145,5 +144,5 @@ def _read_robots(release: Release) -> dict[int, Metrics]:
             text = read_page(release, pod.metadata.name, METRICS["world"]["world"])
         except ClusterError:
             continue
-        found[int(pod.metadata.labels[INDEX])] = read_samples(text)
+        found[int(pod.metadata.labels[INDEX])] = read_metrics(text)
     return found

@@ -14,7 +14,6 @@ from cloudrc.cluster.diagnosis import (
     LOOK_UP,
     Finding,
     Objects,
-    Page,
     diagnose,
     ended_containers,
     is_ready,
@@ -25,10 +24,10 @@ from cloudrc.cluster.pods import (
     container_statuses,
     list_pods,
     read_page,
-    read_samples,
     workloads,
 )
 from cloudrc.errors import to_one_line
+from cloudrc.outside.prometheus import Metrics, read_metrics, total
 
 WINDOW = 2.5
 """Time between two looks at the metrics [s], whose counters are updated once a second."""
@@ -36,7 +35,7 @@ ROBOTS_MAX = 8
 """Largest number of robots of a fleet whose metrics are read."""
 PEER = "--peer="
 """Flag of a link container: name and port of the other end."""
-Robot = dict[tuple[str, str], Page]
+Robot = dict[tuple[str, str], Metrics]
 """Component and container -> metrics of the container."""
 
 
@@ -66,7 +65,7 @@ def _unresolved(release: Release, objects: Objects, robots: Mapping[str, Robot])
     found = []
     for robot, pages in robots.items():
         for (component, container), page in pages.items():
-            if container == "link" and page.get("cloudrc_dns_errors_total"):
+            if container == "link" and total(page, "cloudrc_dns_errors_total"):
                 pods = objects.pods[component]
                 pod = next(each for each in pods if each.metadata.labels.get(INDEX, "") == robot)
                 if not _resolves(release, pod):
@@ -113,7 +112,7 @@ def _read_pod(release: Release, component: str, pod: Any) -> Robot:
                     text = read_page(release, pod.metadata.name, port.container_port)
                 except ClusterError:  # it has just ended, or has no time to answer
                     continue
-                found[component, container.name] = read_samples(text)
+                found[component, container.name] = read_metrics(text)
     return found
 
 

@@ -385,9 +385,3 @@ def read_page(release: Release, pod: str, port: int) -> str:
                 if thread.name.startswith(FORWARDER):
                     thread.join(STOP_LIMIT)
             forward.websocket.shutdown()  # the thread does not, if the server ends first
-
-
-def read_samples(text: str) -> dict[str, float]:
-    """Parse a page of metrics: name with labels, as in `name{label="value"}` -> value."""
-    lines = (line.rpartition(" ") for line in text.splitlines() if not line.startswith("#"))
-    return {name: float(value) for name, _, value in lines}

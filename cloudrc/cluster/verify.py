@@ -19,8 +19,9 @@ from typing import Any, TypeAlias
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.pods import METRICS, find_pod, forwarded
 from cloudrc.errors import TimedOutError
-from cloudrc.link.verify.causes import Findings, read_evidence, read_metrics
+from cloudrc.link.verify.causes import Findings, read_evidence
 from cloudrc.link.verify.judge import Judgement
+from cloudrc.outside.prometheus import read_metrics
 from cloudrc.runs.links.under_test import LOOPBACK, WAYS
 from cloudrc.runs.links.verify import Report, fetch, make_report
 

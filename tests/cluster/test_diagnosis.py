@@ -9,6 +9,7 @@ import pytest
 from cloudrc.cluster import incidents
 from cloudrc.cluster.diagnosis import diagnose, is_suspicious
 from cloudrc.cluster.incidents import find_causes, observe
+from cloudrc.outside.prometheus import read_metrics
 from tests.cluster.conftest import OUT_OF_MEMORY, deployment, pod, terminated, waiting
 
 SENT = 'cloudrc_datagrams_total{direction="%s",outcome="sent"}'
@@ -25,10 +26,14 @@ def pages(world=None, cloud=None, link=None):
         end: {"cloudrc_ready": 1.0, SENT % sends: 200.0, USED % hears: 200.0, PERIODS: 25.0}
         for end, (sends, hears) in ways.items()
     }
-    return {
+    shown = {
         ("world", "world"): ends["world"] | (world or {}),
         ("cloud", "cloud"): ends["cloud"] | (cloud or {}),
         ("cloud", "link"): {RELAYED: 200.0, "cloudrc_dns_errors_total": 0.0} | (link or {}),
+    }
+    return {
+        place: read_metrics("".join(f"{series} {value}\n" for series, value in page.items()))
+        for place, page in shown.items()
     }
 
 

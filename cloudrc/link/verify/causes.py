@@ -8,12 +8,12 @@ causes that are only inferred from the measurements.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from math import inf, isnan
 from typing import Any, NamedTuple
 
 from cloudrc.link.verify.judge import Judgement
+from cloudrc.outside.prometheus import Metrics, total
 
 LATE, UNREAD, STOPPED = 1.5e-3, 0.003, 0.01
 """Limits of a shaper with enough CPU time: 99 % quantile of its release error [s]; share of
@@ -36,26 +36,20 @@ class ShaperFacts(NamedTuple):
     restored: int = 0  # times that another program removed or changed the qdisc
 
 
-def read_metrics(text: str) -> dict[str, float]:
-    """Parse metrics in Prometheus' text format: `cloudrc_a{b="c"} 1` gives {"a/c": 1.0}."""
-    found = re.findall(r"^cloudrc_(\w+)(?:\{(.*)\})? (\S+)$", text, re.MULTILINE)
-    names = ["/".join((name, *re.findall(r'="([^"]*)"', labels))) for name, labels, _ in found]
-    return {name: float(value) for name, (_, _, value) in zip(names, found, strict=True)}
-
-
 def read_evidence(
-    page: Mapping[str, Any], metrics: Mapping[str, float], sent: int | None = None
+    page: Mapping[str, Any], metrics: Metrics, sent: int | None = None
 ) -> ShaperFacts:
     """Combine the page /link.json of a `link` container with its metrics.
 
     `sent` is the number of datagrams sent to the shaper since it started; None if unknown.
     """
-    received, unread, stopped, periods = (
-        int(metrics.get(name, 0.0))
-        for name in ("link_datagrams_total/received", "link_datagrams_total/unread",
-                     "cpu_throttled_periods_total", "cpu_periods_total")
-    )  # fmt: skip
-    late = metrics.get("link_release_error_seconds/99", 0.0)
+    received, unread = (
+        int(total(metrics, "cloudrc_link_datagrams_total", outcome=outcome))
+        for outcome in ("received", "unread")
+    )
+    stopped = int(total(metrics, "cloudrc_cpu_throttled_periods_total"))
+    periods = int(total(metrics, "cloudrc_cpu_periods_total"))
+    late = total(metrics, "cloudrc_link_release_error_seconds", percentile="99")
     signs = (
         (unread > UNREAD * received, f"{unread} datagrams not read in time"),
         (late > LATE, f"1 % released later than {in_unit(late, 's')}"),
@@ -77,7 +71,7 @@ def read_evidence(
         sent=sent,
         passed=passed if sent is not None else None,
         starved=", ".join(text for holds, text in signs if holds),
-        restored=int(metrics.get("link_restored_total", 0.0)),
+        restored=int(total(metrics, "cloudrc_link_restored_total")),
     )
 
 

@@ -26,15 +26,10 @@ from cloudrc.link.netem import check, find_netems
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import link_profile
 from cloudrc.link.verify import DEFAULT, verdict_of
-from cloudrc.link.verify.causes import (
-    Findings,
-    find_causes,
-    in_unit,
-    read_evidence,
-    read_metrics,
-)
+from cloudrc.link.verify.causes import Findings, find_causes, in_unit, read_evidence
 from cloudrc.link.verify.judge import Flow, Judgement, Measurement, look_twice
 from cloudrc.link.verify.probe import PROBE, plan_probes
+from cloudrc.outside.prometheus import read_metrics
 from cloudrc.outside.refusal import check_names
 from cloudrc.runs.links.under_test import LOOPBACK, WAYS, Way, inside, measure, run_link
 from cloudrc.text import Paint, escape, plain, table
