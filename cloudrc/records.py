@@ -12,7 +12,7 @@ unit ("" if it has none) and the meaning.
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple, TypeAlias
+from typing import Annotated, Literal, NamedTuple, TypeAlias, get_args
 
 from cloudrc.messages import (
     NEVER_NS,
@@ -265,32 +265,46 @@ class PlanFollowed(NamedTuple):
     position: Annotated[Vector, "m", "of the base at that instant, by the plan, world frame"]
 
 
-BY_HAND = ("goto", "driving", "operator_lost")
+ByHand: TypeAlias = Literal["goto", "driving", "operator_lost"]
 """Events of a held mission while the operator moves the setpoint; the mission stays held."""
-UNDER_WAY = ("started", "reached", "held", "resumed", "paused", *BY_HAND)
+UnderWay: TypeAlias = Literal["started", "reached", "held", "resumed", "paused", ByHand]
 """Events after which a mission continues; every other event ends it. After "paused", the process
 that flies the mission ends and the next process continues the mission."""
-FAILURES = (
-    *("timed_out", "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped"),
-    *("onboard_failed", "taken_over", "end_lost"),
-)
+MissionFailure: TypeAlias = Literal[
+    "timed_out",
+    "leg_timed_out",
+    "world_restarted",
+    "guard_stopped",
+    "emergency_stopped",
+    "onboard_failed",
+    "taken_over",
+    "end_lost",
+]
 """Events that end a mission as a failure."""
-
-CONTROLLER_LOST = ("controller_silent", "controller_invalid")
+MissionEnd: TypeAlias = Literal["done", "cancelled", MissionFailure]
+"""Events that end a mission."""
+MissionState: TypeAlias = Literal[
+    "queued", "starting", "flying", "held", "done", "failed", "cancelled"
+]
+"""States of a mission."""
+ControllerLost: TypeAlias = Literal["controller_silent", "controller_invalid"]
 """Codes of faults with which a flight ends, because a program outside that controls the robot does
 not answer, or its answers are wrong."""
+BY_HAND: tuple[ByHand, ...] = get_args(ByHand)
+UNDER_WAY: tuple[UnderWay, ...] = get_args(UnderWay)
+FAILURES: tuple[MissionFailure, ...] = get_args(MissionFailure)
+CONTROLLER_LOST: tuple[ControllerLost, ...] = get_args(ControllerLost)
 
 
 class MissionEvent(NamedTuple):
     """Made by cloud: an event of the mission. Topic /mission.
 
-    During the mission, `event` is one of `UNDER_WAY`. At the end of the mission, `event` is "done",
-    "cancelled" or one of `FAILURES`.
+    The last event is that of the end.
     """
 
     stamp_ns: int
     event: Annotated[
-        str,
+        Literal[UnderWay, MissionEnd],
         "",
         "started, reached, held, resumed, goto, driving, operator_lost; at the end the outcome: "
         f"done, cancelled, {', '.join(FAILURES)}",

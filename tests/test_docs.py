@@ -4,9 +4,11 @@
 
 import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from cloudrc.metrics.verdict import FailureCode
 from cloudrc.record.topics import TOPICS
 from tests.support.commands import python
 from tools import docs
@@ -34,6 +36,12 @@ def test_a_generated_file_is_current(path):
 def test_no_generated_file_is_left_over():
     assert docs.leftovers(OUTPUTS) == [], "run: make docs"
     assert docs.SAMPLING.keys() == TOPICS.keys()
+
+
+def test_each_failure_code_is_explained_once():
+    page = (ROOT / "docs" / "verdict.md").read_text()
+    cells = re.findall(r"^\| (`.*?) \|", page, re.MULTILINE)
+    assert sorted(re.findall(r"\w+", " ".join(cells))) == sorted(get_args(FailureCode))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())

@@ -12,7 +12,7 @@ import json
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from math import nan
-from typing import TYPE_CHECKING, Any, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 from cloudrc.exposition import table
 from cloudrc.exposition.parts import Histogram, Readings, samples
@@ -43,6 +43,7 @@ from cloudrc.records import (
     Lateness,
     LinkChecked,
     MissionEvent,
+    MissionState,
     PlanFollowed,
     Record,
     SensorRead,
@@ -355,7 +356,7 @@ class MissionMetrics:
         self._values = values
         self._set("idle", NO_WAYPOINT)
 
-    def _set(self, state: str, waypoint: int) -> None:
+    def _set(self, state: Literal["idle"] | MissionState, waypoint: int) -> None:
         self._values["cloudrc_mission_state"] = table.MISSION_STATES.index(state)
         self._values["cloudrc_mission_waypoint"] = waypoint
 

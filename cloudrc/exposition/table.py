@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from enum import Enum
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 from cloudrc.messages import Cause, GuardState
 from cloudrc.metrics.definitions import QUANTITIES
-from cloudrc.records import FAILURES, Control
+from cloudrc.records import Control, MissionEnd, MissionState
 
 WORLD, CLOUD, TELEOP, LINK, CELL = "world", "cloud", "teleop", "link", "cell"
 ROLES = (WORLD, CLOUD, TELEOP, LINK, CELL)
@@ -55,9 +55,9 @@ LIMITS = ("speed", "yaw_rate", "fence")
 GUARD_STATES = tuple(state.name.lower() for state in GuardState)
 GUARD_CAUSES = {cause: cause.words.partition(",")[0] for cause in Cause}
 """Cause of a guard's state -> value of the label `cause`, the first words of the cause."""
-MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
+MISSION_STATES = ("idle", *(state for state in get_args(MissionState) if state != "queued"))
 """States of a mission; the value of `cloudrc_mission_state` is the index of the state."""
-MISSION_OUTCOMES = ("done", "cancelled", *FAILURES, "other")
+MISSION_OUTCOMES = (*get_args(MissionEnd), "other")
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
 """Outcomes of a datagram at the relay; `cloudrc.link.carry.udp.Relay.counts` explains them."""
 RELEASE_PERCENTILES = ("50", "99", "99.9")

@@ -28,7 +28,7 @@ from cloudrc.metrics.definitions import QUANTITIES, RecordQuantity
 from cloudrc.record.columns import Recording, Table, datagrams, join
 from cloudrc.record.holes import Hole
 from cloudrc.record.topics import BY_SOURCE
-from cloudrc.records import UNDER_WAY, Control, Record
+from cloudrc.records import UNDER_WAY, Control, MissionEnd, Record
 
 if TYPE_CHECKING:
     from cloudrc.config.schema import Criteria, MissionConfig
@@ -96,7 +96,7 @@ class Flight:
         return 0.0 if self.end_ns is None else float(self.seconds(self.end_ns))
 
     @cached_property
-    def ending(self) -> tuple[int, str, str] | None:
+    def ending(self) -> tuple[int, MissionEnd, str] | None:
         """Event that ended the mission: stamp [ns], name, text; None if there is no such event."""
         if (start_ns := self.start_ns) is None:
             return None

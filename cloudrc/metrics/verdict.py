@@ -23,7 +23,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from math import inf
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -43,7 +43,12 @@ from cloudrc.metrics.response import responses
 from cloudrc.record import STOPPED
 from cloudrc.record.columns import Recording
 from cloudrc.record.holes import describe
-from cloudrc.records import CONTROLLER_LOST, REAL_TIME_FACTOR_MIN
+from cloudrc.records import (
+    CONTROLLER_LOST,
+    REAL_TIME_FACTOR_MIN,
+    ControllerLost,
+    MissionFailure,
+)
 from cloudrc.rounding import exceeds
 
 if TYPE_CHECKING:
@@ -56,14 +61,38 @@ EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 """Exit code of each outcome. Source: docs/trouble.md, "What the exit code says"."""
 PLUGIN_FAILURES_MAX = 0.01
 """Largest share of periods in which a plug-in may fail in a valid flight, in [0, 1]."""
-BROKEN_OFF = ("interrupted", "cancelled", "disk_full")
+FailureCode: TypeAlias = Literal[
+    MissionFailure,
+    ControllerLost,
+    "cancelled",
+    "contact_too_fast",
+    "disk_full",
+    "guard_held",
+    "guard_intervened",
+    "interrupted",
+    "mission_not_ended",
+    "no_telemetry",
+    "not_real_time",
+    "not_recorded",
+    "not_settled",
+    "not_started",
+    "not_touched",
+    "obstacle_touched",
+    "plugin_failed",
+    "recording_incomplete",
+    "time_limit_exceeded",
+    "unstable",
+    "waypoint_not_reached",
+]
+"""Codes of failures; docs/verdict.md explains them."""
+BROKEN_OFF: tuple[FailureCode, ...] = ("interrupted", "cancelled", "disk_full")
 """Codes of an `Ending` that interrupts a mission; the goals then need not be met."""
 NOT_STARTED = (
     "the robot never left the ground, because it got no fresh commands or no request to"
     " start; look at the link: its loss, its damage (corrupt), and its delays beside"
     " guard.command_age_max_ms"
 )
-PROVEN_BY_ALL = (
+PROVEN_BY_ALL: tuple[FailureCode, ...] = (
     "not_recorded",
     "not_started",
     "mission_not_ended",
@@ -87,7 +116,7 @@ def exit_code(report: Mapping[str, Any]) -> int:
 class FlightFailure:
     """A criterion of success that is not met."""
 
-    code: str  # one word, for programs
+    code: FailureCode
     text: str  # for people
     time: float | None = None  # time since the start of the mission [s]; None if unknown
     place: Vector | None = None  # true position of the base at that time [m]; None if unknown
@@ -121,9 +150,9 @@ UNKNOWN = Moment()
 
 
 class Ending(NamedTuple):
-    """How a mission ended: one word for programs, and a text for users."""
+    """How a mission ended: a code for programs, and a text for users."""
 
-    code: str
+    code: Literal["done"] | FailureCode
     text: str
 
 
@@ -148,9 +177,7 @@ def judge(evidence: Evidence) -> FlightVerdict:
     """Judge a mission by its evidence; the verdict lists all violations and unmet goals."""
     violations = (*_too_fast(evidence), *evidence.violations)
     if evidence.ending.code in BROKEN_OFF:
-        return FlightVerdict(
-            "interrupted", (FlightFailure(*evidence.ending, *evidence.end), *violations)
-        )
+        return FlightVerdict("interrupted", (*_bad_ending(evidence), *violations))
     codes = {failure.code for failure in violations}
     unmet = [f for f in _unmet_goals(evidence) if f.code not in codes]
     proven = [f for f in unmet if not evidence.lost or f.code not in PROVEN_BY_ALL]
@@ -185,10 +212,16 @@ def _too_fast(evidence: Evidence) -> Iterator[FlightFailure]:
     yield FlightFailure("contact_too_fast", text, *moment)
 
 
+def _bad_ending(evidence: Evidence) -> Iterator[FlightFailure]:
+    """Yield a failure unless the mission is done."""
+    code, text = evidence.ending
+    if code != "done":
+        yield FlightFailure(code, text, *evidence.end)
+
+
 def _unmet_goals(evidence: Evidence) -> Iterator[FlightFailure]:
     ending, end = evidence.ending, evidence.end
-    if ending.code != "done":
-        yield FlightFailure(*ending, *end)
+    yield from _bad_ending(evidence)
     if ending.code in ("not_started", "onboard_failed"):  # then the goals say nothing more
         return
     if evidence.reached < evidence.waypoints:
@@ -426,7 +459,9 @@ class Observations:
     touch_speed: float | None = None  # of the first touch of what the mission has to touch [m/s]
     slip_ns: int = 0  # time by which world's clock fell behind while teleop ran [ns]
 
-    def news(self, before: Observations, elapsed: float, body: str) -> Iterator[tuple[str, str]]:
+    def news(
+        self, before: Observations, elapsed: float, body: str
+    ) -> Iterator[tuple[Literal["touched", "obstacle_touched"], str]]:
         """Yield event name and text of each contact since the earlier observations `before`.
 
         `elapsed` is the present mission time [s]. `body` is what the mission has to touch.

@@ -107,6 +107,7 @@ def _fields(cls: Any, part: str) -> Iterator[Field]:
     for name, hint in get_type_hints(cls, include_extras=True).items():
         if get_origin(hint) is Annotated:
             kind, unit, text = get_args(hint)
+            kind = str if get_origin(kind) is Literal else kind
             column = "odometry_stamp_ns" if name == "stamp_ns" else name
             yield Field(column, _KINDS[kind], unit, text, part + name)
 

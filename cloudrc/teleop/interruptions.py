@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from cloudrc.messages import GuardState
-from cloudrc.metrics.verdict import FlightFailure
-from cloudrc.teleop.wire import RobotStatus
+from cloudrc.metrics.verdict import FailureCode, FlightFailure
+from cloudrc.teleop.wire import EventName, RobotStatus
 from cloudrc.text import describe_point
 
 SILENCE = 1.0
@@ -60,7 +60,9 @@ class Interruptions:
     def __init__(self) -> None:
         self._silence, self._hold = Interruption(0.0), Interruption(HOLD_TOLD)
 
-    def see(self, seen: RobotStatus, time: float, *, flies: bool) -> Iterator[tuple[str, str]]:
+    def see(
+        self, seen: RobotStatus, time: float, *, flies: bool
+    ) -> Iterator[tuple[EventName, str]]:
         """Process telemetry; yield event and text of each interruption that begins or ends.
 
         `time` is the time since the mission began [s], `flies` whether the mission has started.
@@ -77,7 +79,7 @@ class Interruptions:
 
     def wait(
         self, seen: RobotStatus | None, time: float, age: float, *, cloud_is_silent: bool
-    ) -> Iterator[tuple[str, str]]:
+    ) -> Iterator[tuple[EventName, str]]:
         """Yield event and text if telemetry has become silent.
 
         `seen` is the newest telemetry, `age` its age [s], or the time for which this process has
@@ -93,7 +95,7 @@ class Interruptions:
 
     def failures(self, time: float) -> tuple[FlightFailure, ...]:
         """Return the interruptions of a mission that ends at `time` [s] and is not done."""
-        kinds = {
+        kinds: dict[FailureCode, tuple[Interruption, str]] = {
             "no_telemetry": (self._silence, "no telemetry"),
             "guard_held": (self._hold, "the guard was in HOLD"),
         }

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import dist
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from cloudrc.geometry.fence import Fence
 from cloudrc.messages import (
@@ -37,7 +37,8 @@ from cloudrc.messages import (
     Start,
     Vector,
 )
-from cloudrc.records import MissionEvent
+from cloudrc.metrics.verdict import Ending
+from cloudrc.records import MissionEnd, MissionEvent, MissionFailure, MissionState, UnderWay
 from cloudrc.teleop.aim import NO_WAYPOINT, Aim
 from cloudrc.teleop.carrot import HEARTBEAT_NS
 from cloudrc.teleop.refusals import ConflictError
@@ -58,7 +59,7 @@ from cloudrc.text import describe_point
 if TYPE_CHECKING:
     from cloudrc.teleop.store import MissionRecord
 
-UNDER_WAY = FLYING, STARTING, HELD
+UNDER_WAY: tuple[MissionState, ...] = FLYING, STARTING, HELD
 """States of a mission that has begun and has not ended."""
 GIVE_UP_NS = 5_000_000_000
 """Longest time for which teleop tries to tell the robot that the mission has ended [ns]."""
@@ -74,6 +75,7 @@ class MissionFlight:
         number: Identifies the mission on board; 0: the robot stores no progress.
         state: State of the mission.
         outcome: Event that has ended the mission; None before.
+        ending: Its code and text.
     """
 
     def __init__(
@@ -92,8 +94,9 @@ class MissionFlight:
         """
         self.plan, self.number, self._id = mission.order.plan, mission.number, mission.id
         self.route = Route(self.plan, mission.waypoint, aim)
-        self.state = STARTING
+        self.state: MissionState = STARTING
         self.outcome: MissionEvent | None = None
+        self.ending: Ending | None = None
         self._aim, self._requests, self._tell, self._is_ended = aim, requests, tell, is_ended
         self._began_ns = now_ns - round(mission.elapsed * 1e9)
         # Whether an earlier teleop has begun the mission, and whether it was held then.
@@ -167,7 +170,7 @@ class MissionFlight:
         self._aim.select_here()  # cloud keeps this setpoint if the request is lost
         self._aim.stays = True
 
-    def end(self, now_ns: int, code: str, text: str) -> None:
+    def end(self, now_ns: int, code: MissionEnd, text: str) -> None:
         """End the mission, and ask the robot to hold; report the event `code` with its `text`."""
         seen, requests = self._aim.seen, self._requests
         if code != "done" and self.number:
@@ -178,6 +181,7 @@ class MissionFlight:
         else:
             requests.forget()  # the new mission must not end
         self._aim.select_here()
+        self.ending = Ending(code, text)
         self.outcome = self._report(code, text, now_ns)
 
     def see(self, seen: RobotStatus, now_ns: int, confirmed: Request | None) -> None:
@@ -241,12 +245,12 @@ class MissionFlight:
         seen = self._aim.seen
         return seen.reached if seen and seen.mission_id == self.number != 0 else 0
 
-    def _check(self, verb: str, needed: str) -> None:
+    def _check(self, verb: str, needed: MissionState) -> None:
         if self.state != needed:
             text = f"{verb}: the mission is {self.state}; it must be {needed}"
             raise ConflictError(text, self._id)
 
-    def _find_failure(self, seen: RobotStatus) -> tuple[str, str] | None:
+    def _find_failure(self, seen: RobotStatus) -> tuple[MissionFailure, str] | None:
         """Return an event's code and text if telemetry shows that the mission fails, else None."""
         if self._world not in ("", seen.world):
             return "world_restarted", "world restarted"
@@ -259,7 +263,8 @@ class MissionFlight:
             text = "the robot reports that the mission is over, but its outcome is lost;"
             return "end_lost", text
         if seen.guard > HOLD:
-            code = "onboard_failed" if seen.cause is Cause.FAILED else "guard_stopped"
+            has_failed = seen.cause is Cause.FAILED
+            code: MissionFailure = "onboard_failed" if has_failed else "guard_stopped"
             return code, f"guard went to {seen.guard.name} ({seen.cause.words})"
         return None
 
@@ -326,7 +331,11 @@ class MissionFlight:
             self._aim.select_leg(leg, now_ns)
 
     def _report(
-        self, code: str, text: str, now_ns: int, waypoint: int | None = None
+        self,
+        code: Literal[UnderWay, MissionEnd],
+        text: str,
+        now_ns: int,
+        waypoint: int | None = None,
     ) -> MissionEvent:
         """Tell an event, by default one of the current waypoint; the last one stays current."""
         if waypoint is None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import radians
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import ConfigDict, Field, ValidationError
 
@@ -36,9 +36,10 @@ from cloudrc.config.schema import (
 from cloudrc.config.section import Described, Section
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Vector
-from cloudrc.records import FAILURES
+from cloudrc.metrics.verdict import FailureCode, Outcome
+from cloudrc.records import MissionEnd, MissionState
 from cloudrc.teleop.store import SHOWN, Order
-from cloudrc.teleop.wire import Leg, Plan
+from cloudrc.teleop.wire import EventName, Leg, Plan
 
 PROBLEMS_MAX = 50
 """Largest number of problems that one answer lists."""
@@ -126,7 +127,7 @@ class Reached(_Answer):
 class Failure(_Answer):
     """A rule that the mission has broken."""
 
-    code: str
+    code: FailureCode
     """One word, for programs"""
     text: str
     """Reason in words"""
@@ -135,7 +136,7 @@ class Failure(_Answer):
 class Verdict(_Answer):
     """Result of a mission that has ended."""
 
-    outcome: Literal["success", "failure", "invalid", "interrupted"]
+    outcome: Outcome
     """As in report.json"""
     exit_code: int
     """Exit code of a Job that flies the mission: 0, 1, 6 or 130"""
@@ -150,12 +151,7 @@ class Event(_Answer):
     """Number of the event; all missions share one count"""
     mission: str
     """Id of the mission"""
-    event: str = Field(
-        description="queued, starting, started, reached, held, resumed, goto, driving, "
-        "operator_lost, restarted, new_session, no_telemetry, telemetry_again, guard_holds, "
-        "hold_over, link_changed, touched, obstacle_touched, paused; at the end done, cancelled, "
-        f"{', '.join(FAILURES)}"
-    )
+    event: EventName = Field(description=f"At the end {', '.join(get_args(MissionEnd))}")
     waypoint: int
     """Index of the waypoint, from 0"""
     text: str
@@ -173,7 +169,7 @@ class MissionSummary(_Answer):
     """Name in the order"""
     key: str
     """Key in the order"""
-    state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"]
+    state: MissionState
     by_hand: bool
     """Whether an operator drives the robot by hand"""
     waypoint: int

@@ -15,14 +15,14 @@ from typing import Any
 from cloudrc.geometry.fence import Fence
 from cloudrc.messages import GuardState, Setpoint
 from cloudrc.metrics.flight import finite
-from cloudrc.metrics.verdict import Ending, Observations, judge
+from cloudrc.metrics.verdict import Observations, judge
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.interruptions import SILENCE, Interruptions
 from cloudrc.teleop.mission import MissionFlight, Teleop
 from cloudrc.teleop.refusals import ConflictError
 from cloudrc.teleop.store import MissionRecord, MissionStore
 from cloudrc.teleop.view import RobotView
-from cloudrc.teleop.wire import FLYING, HELD, QUEUED, Output, RobotStatus
+from cloudrc.teleop.wire import FLYING, HELD, QUEUED, EventName, Output, RobotStatus
 from cloudrc.text import describe_point
 
 _, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -177,7 +177,7 @@ class MissionRunner:
             self._outputs.append(Fault(now_ns, "journal", self._trouble))
 
     def note(
-        self, mission: MissionRecord, event: str, text: str, now_ns: int, **changed: Any
+        self, mission: MissionRecord, event: EventName, text: str, now_ns: int, **changed: Any
     ) -> None:
         """Store an event of a mission, and the fields that it has `changed`."""
         if mission is self.current:
@@ -244,16 +244,16 @@ class MissionRunner:
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
             changed |= {"world": seen.world, "witness": Observations()}
-        if event == flight.outcome:
+        if event == flight.outcome and (ending := flight.ending):
             elapsed = flight.elapsed(now_ns)
             evidence = mission.witness.evidence(
-                Ending(event.event, event.text),
+                ending,
                 elapsed,
                 waypoints=len(mission.order.plan.waypoints),
                 reached=len(mission.reached),
                 wanted=mission.order.touch,
             )
-            if event.event != "done":  # an interruption may be the reason
+            if ending.code != "done":  # an interruption may be the reason
                 told = self._interruptions.failures(elapsed)
                 evidence = replace(evidence, violations=(*evidence.violations, *told))
             changed["verdict"] = judge(evidence).as_json()

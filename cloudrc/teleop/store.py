@@ -23,8 +23,9 @@ from pydantic import TypeAdapter
 from cloudrc.config.schema import Touch
 from cloudrc.errors import CloudrcError, StateError
 from cloudrc.metrics.verdict import Observations
+from cloudrc.records import MissionState
 from cloudrc.teleop.refusals import UnavailableError, UnknownMissionError
-from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
+from cloudrc.teleop.wire import ENDED, QUEUED, STATES, EventName, Plan
 
 Event: TypeAlias = dict[str, Any]
 """An event of a mission, in the form of the API's model `Event`."""
@@ -56,7 +57,7 @@ class MissionRecord:
     id: str  # such as "m1"
     order: Order
     number: int  # identifies the mission on board; below 2^63
-    state: str = QUEUED  # one of the values of `STATES`
+    state: MissionState = QUEUED
     world: str = ""  # world's process in which the mission started; "" before
     elapsed: float = 0.0  # duration of the mission at its last event [s]
     reached: list[dict[str, Any]] = field(default_factory=list)  # waypoints with their times [s]
@@ -76,7 +77,13 @@ class MissionRecord:
         return min(len(self.reached), len(self.order.plan.legs) - 1)
 
     def apply(
-        self, number: int, event: str, text: str, *, waypoint: int | None = None, **changed: Any
+        self,
+        number: int,
+        event: EventName,
+        text: str,
+        *,
+        waypoint: int | None = None,
+        **changed: Any,
     ) -> None:
         """Add an event to the mission, and set the mission's attributes that `changed` names.
 
@@ -213,7 +220,7 @@ class MissionStore:
 
     def stopped(self) -> MissionRecord | None:
         """Return the mission that was flown last if an emergency stop ended it, else None."""
-        events = {"started", "emergency_stopped"}
+        events: set[EventName] = {"started", "emergency_stopped"}
         flown = [each for each in self.missions.values() if each.happened.keys() & events]
         return flown[-1] if flown and "emergency_stopped" in flown[-1].happened else None
 
@@ -250,7 +257,7 @@ class MissionStore:
             del self.missions[each]
         return mission
 
-    def note(self, mission: MissionRecord, event: str, text: str, **changed: Any) -> None:
+    def note(self, mission: MissionRecord, event: EventName, text: str, **changed: Any) -> None:
         """Store an event and `changed` fields of a mission; `catch_up` repeats a failed write."""
         if event == "reached" and changed["waypoint"] < len(mission.reached):
             return  # an earlier teleop has stored it

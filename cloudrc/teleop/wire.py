@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from math import dist, isinf, nan, radians
-from typing import NamedTuple, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 from pydantic import TypeAdapter
 from pydantic_core import to_json
@@ -30,7 +30,7 @@ from cloudrc.messages import (
     Start,
     Vector,
 )
-from cloudrc.records import FAILURES, Control, MissionEvent
+from cloudrc.records import FAILURES, Control, MissionEnd, MissionEvent, MissionState, UnderWay
 from cloudrc.rounding import exceeds
 
 
@@ -123,13 +123,37 @@ class RobotStatus(NamedTuple):
     sensors: tuple[float, ...] = ()  # of the robot's own sensors, in the order of `robot.yaml`
 
 
-QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
+QUEUED: Final = "queued"
+STARTING: Final = "starting"
+FLYING: Final = "flying"
+HELD: Final = "held"
 """States of a mission that has not ended; STARTING ends when telemetry shows the start."""
-ENDED = "done", "failed", "cancelled"
+ENDED: tuple[MissionState, ...] = ("done", "failed", "cancelled")
 """States of a mission that has ended."""
-STATES = {
-    **{state: state for state in (QUEUED, STARTING, HELD, "done", "cancelled")},
-    **dict.fromkeys(("started", "resumed"), FLYING),
+EventName: TypeAlias = Literal[
+    UnderWay,
+    MissionEnd,
+    "queued",
+    "starting",
+    "restarted",
+    "new_session",
+    "no_telemetry",
+    "telemetry_again",
+    "guard_holds",
+    "hold_over",
+    "link_changed",
+    "touched",
+    "obstacle_touched",
+]
+"""Events in the log of a mission: those of `MissionEvent`, and what teleop alone notes."""
+STATES: dict[EventName, MissionState] = {
+    "queued": QUEUED,
+    "starting": STARTING,
+    "started": FLYING,
+    "resumed": FLYING,
+    "held": HELD,
+    "done": "done",
+    "cancelled": "cancelled",
     **dict.fromkeys(FAILURES, "failed"),
 }
 """Event -> state of the mission after the event; all other events leave the state as it is."""

@@ -127,7 +127,8 @@ class FleetFlight:
         member, leg = self._run.members[number], self._legs[number]
         if member.over() or now_ns >= member.limit_ns:
             failures = self._judge(number).verdict.failures
-            codes, text = [each.code for each in failures], failures[0].text if failures else ""
+            codes: list[str] = [each.code for each in failures]
+            text = failures[0].text if failures else ""
         elif now_ns > self._latest_ns[number][leg]:
             codes = ["timed_out"]
             text = f"at waypoint {leg + 1} after {now_ns / 1e9:.0f} s: the time limit is too near"

@@ -6,7 +6,7 @@ import heapq
 import math
 from enum import IntEnum
 from operator import attrgetter
-from typing import get_args, get_origin, get_type_hints
+from typing import Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 from hypothesis import strategies as st
@@ -42,6 +42,8 @@ def _strategy(name, kind):
         return st.none() | instances(rec.SensorLabel)
     if get_origin(kind) is tuple:
         return st.tuples(*[_metres] * 3) if len(get_args(kind)) == 3 else _directions.map(_unit)
+    if get_origin(kind) is Literal:
+        return st.sampled_from(get_args(kind))
     if issubclass(kind, IntEnum):
         return st.sampled_from(kind)
     if name == "stamp_ns":
