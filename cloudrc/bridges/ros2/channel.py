@@ -22,7 +22,7 @@ def check() -> None:
 
 
 def lock_step(namespace: str, start_limit: float, gone: Callable[[], bool]) -> RosLockStep:
-    """Wait for a node below `namespace`, in virtual time."""
+    """Wait for a node below `namespace`, in virtual time, for at most `start_limit` [s]."""
     from cloudrc.bridges.ros2.lock_step import RosLockStep
 
     return RosLockStep(namespace, start_limit, gone)
@@ -31,7 +31,10 @@ def lock_step(namespace: str, start_limit: float, gone: Callable[[], bool]) -> R
 def driver(
     peer: UnixDatagrams, namespace: str, start_limit: float, tell: Callable[[str], None]
 ) -> RosDriver:
-    """Exchange messages with a node below `namespace`, in real time."""
+    """Exchange messages with a node below `namespace`, in real time.
+
+    A node may start at any time: `start_limit` [s] is for a program that has to answer.
+    """
     from cloudrc.bridges.ros2.driver import RosDriver
 
     return RosDriver(peer, namespace, tell)

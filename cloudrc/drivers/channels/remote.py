@@ -57,14 +57,14 @@ def check() -> None:
 
 
 def lock_step(url: str, start_limit: float, gone: Callable[[], bool]) -> LockStep:
-    """Connect to the program at `url` in virtual time."""
+    """Connect to the program at `url` in virtual time; wait `start_limit` [s] for an answer."""
     return LockStep(url, start_limit)
 
 
 def driver(
     peer: UnixDatagrams, url: str, start_limit: float, tell: Callable[[str], None]
 ) -> RemoteDriver:
-    """Connect to the program at `url` in real time."""
+    """Connect to the program at `url` in real time; wait `start_limit` [s] for an answer."""
     return RemoteDriver(peer, url, start_limit)
 
 
