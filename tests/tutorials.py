@@ -18,8 +18,9 @@ from tests.support.pages import SHELL, blocks_of, files_of
 
 OTHER_NUMBERS = "other numbers"
 """Mark of a block of `text` whose numbers differ each time, because the commands took real time."""
-FAILS = re.compile(r"FAILURE: |^\d+ success, [1-9]\d* failure", re.MULTILINE)
-"""What a command says whose mission, or a flight of whose sweep, fails: it exits with 1."""
+FAILS = re.compile(r"FAILURE: |^\d+ success, [1-9]\d* failure|^no value is stable", re.MULTILINE)
+"""What a command says that exits with 1: a mission fails, or a flight of a sweep, or a loop is
+stable at no delay, as with an empty template."""
 READY = "to end: "
 """Begin of the line with which a session says that commands may come."""
 
