@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.compare import flight_arguments
-from cloudrc.cli.output import output_argument, print_result, tell_seeds
+from cloudrc.cli.output import output_argument, print_result, warn_of_few_seeds
 from cloudrc.cli.parser import Options, Parser, flags, number
 from cloudrc.text import escape
 
@@ -52,7 +52,7 @@ def execute(options: Options) -> int:
     margin = Margin(Asked(*asked, options.max, options.resolution))
     present, _ = margin.experiment(margin.present)
     assert present is not None, "the search begins with a value that flies"
-    tell_seeds(options.seeds, present)
+    warn_of_few_seeds(options.seeds, present)
     with Progress("flies") as view:
         for name in margin.questions:
             _search(options, margin, name, view.say)

@@ -204,10 +204,10 @@ def warn(*experiments: ResolvedExperiment, seeds: int = 1) -> None:
     from cloudrc.runs.experiment import advice_on
 
     print_lines((f"cloudrc: warning: {text}" for text in advice_on(*experiments)), sys.stderr)
-    tell_seeds(seeds, *experiments)
+    warn_of_few_seeds(seeds, *experiments)
 
 
-def tell_seeds(seeds: int, *experiments: ResolvedExperiment) -> None:
+def warn_of_few_seeds(seeds: int, *experiments: ResolvedExperiment) -> None:
     """Say if several seeds fly over one and the same part of a time line."""
     from cloudrc.config.time_line import describe_one_time_line
 
