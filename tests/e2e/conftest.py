@@ -356,7 +356,7 @@ def pytest_runtest_makereport(item, call):
     report = yield
     judges = item.get_closest_marker("real_time") and STARTED in item.stash
     if report.failed and judges and (why := busy(item.stash[STARTED])):
-        SUMMARY.append(f"{item.name}: {why}")
+        SUMMARY.append(f"{item.name}: {call.excinfo.exconly().splitlines()[0]}; {why}")
         report.outcome = "skipped"
         report.longrepr = (str(item.path), item.location[1] or 0, f"Skipped: {TOO_BUSY}")
     if report.failed and item.config.stash.get(UP, False):
