@@ -99,8 +99,9 @@ def assemble(
     from cloudrc.drivers.faults import disturbed, faulty_clock
     from cloudrc.drivers.virtual import CPU_CLOCK, Clock, VirtualRun
 
-    own = Clock(round(experiment.cloud.clock_offset_s * 1e9), experiment.cloud.clock_drift_ppm)
-    own, faults = faulty_clock(own, experiment.faults), experiment.faults
+    settings, faults = experiment.cloud, experiment.faults
+    usual = Clock(round(settings.clock_offset_s * 1e9), settings.clock_drift_ppm)
+    own = faulty_clock(usual, faults)
     links, start_ns = build_links(experiment), phase_ns(experiment)
     passes = not any(link.corrupts for link in links)  # only bytes can be damaged
     clock_id = VIRTUAL_CLOCK if own == Clock() else CLOUD_CLOCK

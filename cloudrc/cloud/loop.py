@@ -27,7 +27,7 @@ from math import nan
 from typing import Any
 
 from cloudrc.cloud.controllers import STAND_STILL, Controller, ControlOutput
-from cloudrc.cloud.controllers.pid import Pid
+from cloudrc.cloud.controllers.pid import Law, Pid
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.motion import Body, pack_goal
 from cloudrc.cloud.news import SendOnDelta
@@ -116,10 +116,10 @@ class ControlLoop:
         self._build_estimator, self._predictor = build_estimator, predictor
         self._controller = controller
         self._plans_itself: Any = getattr(controller, "plan", None)
-        self._law = controller.law if type(controller) is Pid else None
+        self._law: Law | None = None
         self._copy: Callable[[Controller], Controller] = deepcopy
-        if type(controller) is Pid:  # its state is numbers alone
-            self._copy = copy
+        if type(controller) is Pid:  # not a user's class that derives from it
+            self._law, self._copy = controller.law, copy  # its state is numbers alone
         self._trusts_predictor, self._trusts_controller = is_ours(predictor), is_ours(controller)
         methods = (getattr(predictor, name) for name in ("observe", "commanded", "applied"))
         self._observe, self._commanded, self._applied = (
