@@ -26,8 +26,6 @@ from tests.e2e.conftest import (
 )
 from tests.e2e.neighbours import promtool, queries, stranger
 
-pytestmark = pytest.mark.real_time
-
 MISSION = "paper-mission"
 LIMIT_TIME = 360.0
 """Time limit from `kind create cluster` to the completed Job [s]."""
@@ -68,6 +66,7 @@ def malformed():
     return sum(value(metrics(end), name, outcome=outcome) for end in ("world", "cloud"))
 
 
+@pytest.mark.real_time
 def test_the_papers_mission_ends_complete(first, note):
     note(f"from 'kind create cluster' to a Job that is Complete: {first.seconds:.0f} s")
     assert first.paper.exit_code == 0, first.paper
@@ -75,10 +74,14 @@ def test_the_papers_mission_ends_complete(first, note):
     for number in range(1, 8):
         assert first.log.count(f"waypoint {number} of 7 reached") == 1
     assert "success" in first.paper.message.lower()
+
+
+def test_kubectl_describe_shows_the_verdict(first):
     described = kubectl("describe", f"--selector=batch.kubernetes.io/job-name={MISSION}", "pod")
-    assert '"outcome": "success"' in described
+    assert f'"exit_code": {first.paper.exit_code}' in described
 
 
+@pytest.mark.real_time
 def test_the_last_mission_of_a_release_without_a_volume_has_a_report(first, tmp_path):
     found = report(tmp_path / "last", NAME)
     assert (found["verdict"], found["complete"]) == ("success", True)
@@ -111,6 +114,7 @@ def mean(name):
     return f"sum(cloudrc_{name}_seconds_sum) / sum(cloudrc_{name}_seconds_count)"
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize(
     ("query", "series", "low", "high"),
     [

@@ -35,8 +35,6 @@ from tests.e2e.conftest import (
 from tests.e2e.neighbours import queries
 from tools.dashboards import counts
 
-pytestmark = pytest.mark.real_time
-
 SET_WITHIN = 1.0
 """Time limit for `link set` until the change is in force [s]. The fastest call counts, because the
 machine also runs the cluster."""
@@ -130,6 +128,7 @@ def check_delays(name, wanted, seconds, directions, note):
     assert off < TOLERANCE
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize(("profile", "wanted", "seconds"), PROFILES)
 def test_both_delays_are_the_profiles_within_two_milliseconds(
     readings, profile, wanted, seconds, note
@@ -140,6 +139,7 @@ def test_both_delays_are_the_profiles_within_two_milliseconds(
     readings.append(processor_times())
 
 
+@pytest.mark.real_time
 def test_the_link_is_set_by_hand_and_read_back(readings, note):
     took = []
     try:
@@ -166,6 +166,7 @@ def test_the_link_is_set_by_hand_and_read_back(readings, note):
     readings.append(processor_times())
 
 
+@pytest.mark.real_time
 def test_the_operator_holds_moves_and_resumes_a_mission(readings):
     assert "(long): held" in in_release("mission", "hold")
     assert "(long): held" in in_release("mission", "goto", *map(str, ASIDE))
@@ -179,6 +180,7 @@ def test_the_operator_holds_moves_and_resumes_a_mission(readings):
     readings.append(processor_times())
 
 
+@pytest.mark.real_time
 def test_a_release_is_cheap(readings, note):
     asked = max(LIMIT_CPU, ASKED_CPU * pace())
     cpu = cheapest(readings)
