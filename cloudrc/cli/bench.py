@@ -12,7 +12,7 @@ the shortest processor time.
 from __future__ import annotations
 
 from cloudrc.cli.output import output_argument, print_result
-from cloudrc.cli.parser import Options, Parser, flags, read_count
+from cloudrc.cli.parser import Options, Parser, read_count
 
 EPILOG = """\
 'raw mj_step' replays the thrusts and the drag of the same flight in C and must
@@ -23,7 +23,8 @@ ratios of one run are comparable between machines."""
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     output_argument(parser)
-    flags(parser)("--repeats", "N", "how often to measure each part (default: 7)", 7, read_count)
+    about = "how often to measure each part (default: 7)"
+    parser.add_argument("--repeats", type=read_count, default=7, metavar="N", help=about)
 
 
 def execute(options: Options) -> None:

@@ -4,14 +4,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from cloudrc.cli.output import TABLES, output_argument, print_result, tell, warn
 from cloudrc.cli.parser import (
     Options,
     Parser,
-    flags,
     number,
     read_count,
     read_list,
+    set_argument,
     settings_from,
     whole_number,
 )
@@ -33,21 +35,27 @@ set. docs/fleet.md explains the result."""
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = flags(parser)
     about = "experiment to fly: a shipped name or a YAML file (default: steps)"
-    add("experiment", "EXPERIMENT", about, "steps", nargs="?")
+    parser.add_argument("experiment", nargs="?", default="steps", metavar="EXPERIMENT", help=about)
     about = "rate of the cell in each direction (default: that of the experiment)"
-    add("--cell", "KBIT", about, read=number(1e-3, 1e9, "kbit/s"))
+    parser.add_argument("--cell", type=number(1e-3, 1e9, "kbit/s"), metavar="KBIT", help=about)
+    names = read_list(str)
     about = (
         "compare these queues of the cell: fifo, drr, priority or newest, with :PACKETS if wanted"
     )
-    add("--queue", "NAME,...", about, [], read=read_list(str))
-    add("--controllers", "NAME,...", "compare these controllers", [], read=read_list(str))
-    add("--seeds", "N", "fly seeds 1 to N (default: 5)", 5, read_count)
-    add("--max", "N", "largest fleet to try (default: 64)", 64, whole_number(1, 1000))
-    add("--set", "KEY=VALUE", "change one key of the experiment; repeatable")
+    parser.add_argument("--queue", type=names, default=[], metavar="NAME,...", help=about)
+    about = "compare these controllers"
+    parser.add_argument("--controllers", type=names, default=[], metavar="NAME,...", help=about)
+    parser.add_argument(
+        "--seeds", type=read_count, default=5, metavar="N", help="fly seeds 1 to N (default: 5)"
+    )
+    about = "largest fleet to try (default: 64)"
+    parser.add_argument("--max", type=whole_number(1, 1000), default=64, metavar="N", help=about)
+    set_argument(parser)
     about = "folder of the results; with those of an earlier call, fly what is missing"
-    add("--out", "DIR", f"{about} (default: runs/capacity-...)")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help=f"{about} (default: runs/capacity-...)"
+    )
     output_argument(parser, forms=TABLES)
 
 

@@ -4,7 +4,9 @@
 
 from __future__ import annotations
 
-from cloudrc.cli.parser import Options, Parser, flags, read_size, settings_from, whole_number
+from pathlib import Path
+
+from cloudrc.cli.parser import Options, Parser, read_size, settings_from, whole_number
 from cloudrc.cli.processes import read_address, status_arguments
 from cloudrc.drivers.process import StopSignal
 
@@ -17,15 +19,22 @@ HOST becomes the robot's number; without it, the number is added to PORT."""
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     status_arguments(parser)
-    add = flags(parser)
     for name, end, to in (("uplink", "worlds", "clouds"), ("downlink", "clouds", "worlds")):
         about = f"where to receive what {end} send"
-        add(f"--{name}", "HOST:PORT", about, read=read_address, required=True)
-        add(f"--{to}", "HOST:PORT", f"where to send the {name}", read=read_address, required=True)
-    add("--record", "FILE", "CSV file for what the cell does", required=True)
-    add("--record-max", "SIZE", "at this size, such as 20M, the file begins anew", read=read_size)
+        parser.add_argument(
+            f"--{name}", type=read_address, required=True, metavar="HOST:PORT", help=about
+        )
+        about = f"where to send the {name}"
+        parser.add_argument(
+            f"--{to}", type=read_address, required=True, metavar="HOST:PORT", help=about
+        )
+    parser.add_argument(
+        "--record", type=Path, required=True, metavar="FILE", help="CSV file for what the cell does"
+    )
+    about = "at this size, such as 20M, the file begins anew"
+    parser.add_argument("--record-max", type=read_size, metavar="SIZE", help=about)
     about = "number of robots, as after 'kubectl scale' (default: that of the experiment)"
-    add("--robots", "N", about, read=whole_number(1, 1000))
+    parser.add_argument("--robots", type=whole_number(1, 1000), metavar="N", help=about)
 
 
 def execute(options: Options) -> None:

@@ -4,10 +4,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import TABLES, output_argument, print_result, tell, warn_about
-from cloudrc.cli.parser import Options, Parser, flags, read_count
+from cloudrc.cli.parser import Options, Parser, read_count, set_argument
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.text import csv_table, latex_table
 
@@ -31,26 +32,31 @@ examples:
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = flags(parser)
-    add("a", "A", "the setting to compare with")
-    add("b", "B", "the setting to judge")
+    parser.add_argument("a", metavar="A", help="the setting to compare with")
+    parser.add_argument("b", metavar="B", help="the setting to judge")
     flight_arguments(parser, seeds=10)
-    add("--in", "DIR", "compare flights of this sweep", dest="sweep")
+    parser.add_argument(
+        "--in", dest="sweep", type=Path, metavar="DIR", help="compare flights of this sweep"
+    )
     about = "compare this metric instead of the default ones; repeatable"
-    add("--number", "NAME", about, many=True)
+    parser.add_argument("--number", action="append", default=[], metavar="NAME", help=about)
     about = "fly each seed once more without a network; compare J/J0, the cost of control relative"
     where = "where the setpoint waits for the robot off_ideal_path and T/T0"
-    add("--cost", "", f"{about} to that flight, {where}, and the bytes")
+    parser.add_argument(
+        "--cost", action="store_true", help=f"{about} to that flight, {where}, and the bytes"
+    )
     output_argument(parser, forms=TABLES)
 
 
 def flight_arguments(parser: Parser, seeds: int) -> None:
     """Declare --of, --set and --seeds; `seeds` is the default number of seeds."""
-    add = flags(parser)
     about = "experiment to fly: a shipped name or a YAML file (default: steps)"
-    add("--of", "EXPERIMENT", about, "steps", dest="experiment")
-    add("--set", "KEY=VALUE", "change one key of the experiment; repeatable")
-    add("--seeds", "N", f"fly seeds 1 to N (default: {seeds})", seeds, read_count)
+    parser.add_argument(
+        "--of", dest="experiment", default="steps", metavar="EXPERIMENT", help=about
+    )
+    set_argument(parser)
+    about = f"fly seeds 1 to N (default: {seeds})"
+    parser.add_argument("--seeds", type=read_count, default=seeds, metavar="N", help=about)
 
 
 def execute(options: Options) -> int:

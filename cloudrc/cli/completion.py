@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 
-from cloudrc.cli.parser import Options, Parser, flags
+from cloudrc.cli.parser import Options, Parser
 
 EPILOG = """\
 installation:
@@ -22,7 +22,7 @@ installation:
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    flags(parser)("shell", None, "your shell", choices=("bash", "zsh", "fish"))
+    parser.add_argument("shell", choices=("bash", "zsh", "fish"), help="your shell")
 
 
 def execute(options: Options) -> None:

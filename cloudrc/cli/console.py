@@ -10,7 +10,7 @@ from secrets import token_hex
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.output import open_page, print_line, tell
-from cloudrc.cli.parser import Options, Parser, flags, whole_number
+from cloudrc.cli.parser import Options, Parser, whole_number
 from cloudrc.cli.where import (
     api_arguments,
     flown_release,
@@ -42,22 +42,24 @@ switches it off. No key turns the robot: it keeps its heading."""
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = flags(parser)
     about = "folder of the flying run (default: the only run in flight), or a release"
-    add("target", "RUN|RELEASE", about, nargs="?")
+    parser.add_argument("target", nargs="?", type=Path, metavar="RUN|RELEASE", help=about)
     run_argument(parser)
-    port = "port of the page on 127.0.0.1 (default: any free port)"
-    add("--port", "N", port, 0, whole_number(0, 65_535))
+    about = "port of the page on 127.0.0.1 (default: any free port)"
+    parser.add_argument("--port", type=whole_number(0, 65_535), default=0, metavar="N", help=about)
     about = "show the page of a release, and carry out its changes of the link until Ctrl-C"
-    add("--cluster", "", about)
-    add("--no-open", "", "print the page's address, open no browser")
+    parser.add_argument("--cluster", action="store_true", help=about)
+    parser.add_argument(
+        "--no-open", action="store_true", help="print the page's address, open no browser"
+    )
     about = "origin of a proxy that serves the page, such as https://hub.example.org; repeatable"
-    add("--allow-origin", "ORIGIN", about, read=_origin, many=True)
+    parser.add_argument(
+        "--allow-origin", action="append", type=_origin, default=[], metavar="ORIGIN", help=about
+    )
     release_arguments(parser)
     pod = parser.add_argument_group("in the container of the chart")
-    add = flags(pod)
-    add("--config", "FILE", "experiment file")
-    add("--profile", "FILE", "file of the link profile")
+    pod.add_argument("--config", type=Path, metavar="FILE", help="experiment file")
+    pod.add_argument("--profile", type=Path, metavar="FILE", help="file of the link profile")
     api_arguments(pod, "the API of teleop")
 
 

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
 from cloudrc.cli.output import output_argument, paint, print_result
-from cloudrc.cli.parser import Options, Parser, flags
+from cloudrc.cli.parser import Options, Parser
 from cloudrc.drivers.machine import interpreter, usable_cores
 from cloudrc.drivers.namespaces import ProgramEnd
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
@@ -67,19 +67,21 @@ class Check(NamedTuple):
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = flags(parser)
-    add("--mode", None, "the mode to fly in (default: local)", "local", choices=MODES)
+    parser.add_argument(
+        "--mode", choices=MODES, default="local", help="the mode to fly in (default: local)"
+    )
     about = "mode cluster, and survey the cluster: permissions, admission, quota, nodes, images"
-    add("--cluster", "", about)
+    parser.add_argument("--cluster", action="store_true", help=about)
     about = "with --cluster: a value of the chart, as in helm install; repeatable"
-    add("--set", "KEY=VALUE", about)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
     about = "with --cluster: a file of the chart's values, as in helm install; repeatable"
-    add("-f --values", "FILE", about, read=str, many=True)
+    parser.add_argument("-f", "--values", action="append", default=[], metavar="FILE", help=about)
     about = "look at an installed release instead: what it suffers from, and what to do"
-    add("--release", "NAME", about)
-    add("--context", "NAME", "kubeconfig context (default: current)")
-    about = "namespace (default: the context's, or default)"
-    add("-n --namespace", "NAME", about)
+    parser.add_argument("--release", metavar="NAME", help=about)
+    parser.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
+    parser.add_argument(
+        "-n", "--namespace", metavar="NAME", help="namespace (default: the context's, or default)"
+    )
     output_argument(parser)
 
 

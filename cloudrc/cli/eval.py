@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.output import TABLES, again, output_argument, print_result, tell
-from cloudrc.cli.parser import COUNT_MAX, Options, Parser, flags, number, read_count, whole_number
+from cloudrc.cli.parser import COUNT_MAX, Options, Parser, number, read_count, whole_number
 from cloudrc.errors import CloudrcError
 from cloudrc.outside.paths import lock_folder
 from cloudrc.outside.refusal import naming
@@ -38,49 +38,68 @@ files have changed."""
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = flags(parser)
-    add("--env", "ID", "environment of gymnasium: its id, MODULE:ID or ./FILE.py:ID", required=True)
-    add("--env-arg", "KEY=VALUE", "argument of the environment; repeatable")
-    add("--policy", "POLICY", "a Python file, or the address of a server (ws://...)", required=True)
-    add("--link", "PROFILE", "link profile, a name or a file (default: ideal)", "ideal")
+    about = "environment of gymnasium: its id, MODULE:ID or ./FILE.py:ID"
+    parser.add_argument("--env", required=True, metavar="ID", help=about)
+    about = "argument of the environment; repeatable"
+    parser.add_argument("--env-arg", action="append", default=[], metavar="KEY=VALUE", help=about)
+    about = "a Python file, or the address of a server (ws://...)"
+    parser.add_argument("--policy", required=True, metavar="POLICY", help=about)
+    about = "link profile, a name or a file (default: ideal)"
+    parser.add_argument("--link", default="ideal", metavar="PROFILE", help=about)
     about = "mean round trips in ms, such as 0,40,80 (default: the profile's)"
-    add("--rtt", "MS,...", about, (None,), _round_trips)
+    parser.add_argument("--rtt", type=_round_trips, default=(None,), metavar="MS,...", help=about)
     about = "ways to execute answers, such as newest,prefix (default: newest)"
-    add("--executor", "NAME,...", about, "newest")
+    parser.add_argument("--executor", default="newest", metavar="NAME,...", help=about)
     about = "parameters of the executors, such as share=.5"
-    add("--set", "KEY=VALUE", about, nargs="+")
-    about = "time for an answer in s: a number, MEAN,DEVIATION, a file, 'measured'"
-    add("--compute", "TIME", f"{about} (default: 0)", "0")
+    parser.add_argument(
+        "--set", action="append", nargs="+", default=[], metavar="KEY=VALUE", help=about
+    )
+    about = "time for an answer in s: a number, MEAN,DEVIATION, a file, 'measured' (default: 0)"
+    parser.add_argument("--compute", default="0", metavar="TIME", help=about)
     about = "how long the robot waits in a step for an answer, in s (default: 5 %% of it)"
-    add("--answer-within", "S", about, read=number(0, 3600, "seconds"))
+    parser.add_argument("--answer-within", type=number(0, 3600, "seconds"), metavar="S", help=about)
     about = "action before the first answer; 'none': 0; 'answer': the robot waits for it (default)"
-    add("--start", "ACTION", about, "answer")
+    parser.add_argument("--start", default="answer", metavar="ACTION", help=about)
     about = "without an action, the robot repeats its last or executes that of --start"
-    add("--hold", None, about, "repeat", choices=("repeat", "start"))
-    add("--observe-age", "", "the policy observes the age of its observation, too")
+    parser.add_argument("--hold", choices=("repeat", "start"), default="repeat", help=about)
+    about = "the policy observes the age of its observation, too"
+    parser.add_argument("--observe-age", action="store_true", help=about)
     about = "how many of its own last actions the policy observes, too (default: 0)"
-    add("--observe-actions", "N", about, 0, whole_number(0, 1000))
-    add("--observe-step", "", "the policy observes the step of its observation, too")
-    add("--seeds", "N", "seeds 1 to N of each condition (default: 20)", 20, read_count)
-    add("--map", "FILE", "file from the environment's observation to the policy's (YAML)")
+    parser.add_argument(
+        "--observe-actions", type=whole_number(0, 1000), default=0, metavar="N", help=about
+    )
+    about = "the policy observes the step of its observation, too"
+    parser.add_argument("--observe-step", action="store_true", help=about)
+    about = "seeds 1 to N of each condition (default: 20)"
+    parser.add_argument("--seeds", type=read_count, default=20, metavar="N", help=about)
+    about = "file from the environment's observation to the policy's (YAML)"
+    parser.add_argument("--map", type=Path, metavar="FILE", help=about)
     about = "smallest return of a success (default: what the info says)"
-    add("--success-at", "RETURN", about, read=number(-1e30, 1e30, "reward"))
+    parser.add_argument(
+        "--success-at", type=number(-1e30, 1e30, "reward"), metavar="RETURN", help=about
+    )
     about = "time of a step in s, if the environment does not tell it"
-    add("--dt", "S", about, read=number(1e-6, 3600, "seconds"))
-    add("--max-steps", "N", "longest episode in steps (default: 10000)", 10_000, read_count)
+    parser.add_argument("--dt", type=number(1e-6, 3600, "seconds"), metavar="S", help=about)
+    about = "longest episode in steps (default: 10000)"
+    parser.add_argument("--max-steps", type=read_count, default=10_000, metavar="N", help=about)
     about = "largest age of an observation behind an action, in s; older: late"
-    add("--deadline", "S", about, read=number(1e-6, 3600, "seconds"))
+    parser.add_argument("--deadline", type=number(1e-6, 3600, "seconds"), metavar="S", help=about)
     about = "size of an observation on the wire (default: that of its arrays)"
-    add("--observation-bytes", "N", about, read=whole_number(0, 10**9))
+    parser.add_argument("--observation-bytes", type=whole_number(0, 10**9), metavar="N", help=about)
     about = "what of a message arrives (default: stream for a server, else datagrams)"
-    add("--delivery", None, about, choices=("datagrams", "stream"))
+    parser.add_argument("--delivery", choices=("datagrams", "stream"), help=about)
     about = "most bytes of a packet; what is larger is several packets (default: 1200)"
-    add("--packet-bytes", "N", about, 1200, whole_number(1, 10**9))
+    parser.add_argument(
+        "--packet-bytes", type=whole_number(1, 10**9), default=1200, metavar="N", help=about
+    )
     about = "parallel processes for a policy in a file (default: one per core)"
-    add("--jobs", "N", about, COUNT_MAX, read_count)
-    add("--out", "DIR", "folder (default: a new one in runs/); if it has rows, play the others")
-    add("--rows", "FILE", "also write a line per episode into this file: .csv or .parquet")
-    add("--versus", "DIR", "folder of another policy's evaluation, to compare with in pairs")
+    parser.add_argument("--jobs", type=read_count, default=COUNT_MAX, metavar="N", help=about)
+    about = "folder (default: a new one in runs/); if it has rows, play the others"
+    parser.add_argument("--out", type=Path, metavar="DIR", help=about)
+    about = "also write a line per episode into this file: .csv or .parquet"
+    parser.add_argument("--rows", type=Path, metavar="FILE", help=about)
+    about = "folder of another policy's evaluation, to compare with in pairs"
+    parser.add_argument("--versus", type=Path, metavar="DIR", help=about)
     output_argument(parser, forms=TABLES)
 
 

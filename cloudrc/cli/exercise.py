@@ -27,7 +27,7 @@ from cloudrc.cli.output import (
     print_result,
     tell,
 )
-from cloudrc.cli.parser import Options, Parser, add_verbs, flags, read_count, read_size
+from cloudrc.cli.parser import Options, Parser, add_verbs, read_count, read_size
 from cloudrc.errors import BadInputError
 from cloudrc.exercise.watch import LIMITS, Limits
 from cloudrc.files import write_atomically
@@ -53,21 +53,28 @@ JOBS_MAX = 1000
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     new, check = add_verbs(parser, VERBS).values()
-    flags(new)(
-        "task", "TASK", "file of your own task (.yaml), beside the files to fill in", nargs="?"
+    about = "file of your own task (.yaml), beside the files to fill in"
+    new.add_argument("task", nargs="?", metavar="TASK", help=about)
+    new.add_argument(
+        "folder", type=Path, metavar="DIR", help="folder for the files (default: named as TASK)"
     )
-    flags(new)("folder", "DIR", "folder for the files (default: named as TASK)")
-    add = flags(check)
-    add("folders", "DIR", "hand-in: a folder or a zip", nargs="+")
+    check.add_argument(
+        "folders", nargs="+", type=Path, metavar="DIR", help="hand-in: a folder or a zip"
+    )
     about = "the task (default: task.yaml in DIR, or else the exercise)"
-    add("--task", "TASK", about, None, Path)
-    add("--jobs", "N", "hand-ins at once (default: one per usable core)", JOBS_MAX, read_count)
+    check.add_argument("--task", type=Path, metavar="TASK", help=about)
+    about = "hand-ins at once (default: one per usable core)"
+    check.add_argument("--jobs", type=read_count, default=JOBS_MAX, metavar="N", help=about)
     about = "memory of a part and its children together (default: 2Gi)"
-    add("--memory", "SIZE", about, LIMITS.memory, read_size)
+    check.add_argument(
+        "--memory", type=read_size, default=LIMITS.memory, metavar="SIZE", help=about
+    )
     about = f"processes of a part at once (default: {LIMITS.processes})"
-    add("--processes", "N", about, LIMITS.processes, read_count)
+    check.add_argument(
+        "--processes", type=read_count, default=LIMITS.processes, metavar="N", help=about
+    )
     about = "table of an earlier call: score the hand-ins without a row, and add their rows"
-    add("--resume", "FILE", about)
+    check.add_argument("--resume", type=Path, metavar="FILE", help=about)
     output_argument(check, "output format, csv for several hand-ins", forms=("gradescope", "csv"))
 
 

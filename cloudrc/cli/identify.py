@@ -7,7 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cloudrc.cli.output import format_document, output_argument, print_result
-from cloudrc.cli.parser import Options, Parser, flags
+from cloudrc.cli.parser import Options, Parser
 from cloudrc.files import write_atomically
 from cloudrc.outside.paths import check_new
 from cloudrc.text import escape
@@ -22,9 +22,9 @@ examples:
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = flags(parser)
-    add("run", "RUN", "folder of a run, or an MCAP file")
-    add("--out", "FILE", "file for the model (default: model.yaml)", Path("model.yaml"))
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or an MCAP file")
+    about = "file for the model (default: model.yaml)"
+    parser.add_argument("--out", type=Path, default=Path("model.yaml"), metavar="FILE", help=about)
     output_argument(parser)
 
 

@@ -4,8 +4,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from cloudrc.cli.output import print_line
-from cloudrc.cli.parser import Options, Parser, add_verbs, flags
+from cloudrc.cli.parser import Options, Parser, add_verbs
 
 VERBS = {
     "new": "make a key file, or rotate the key in one",
@@ -27,8 +29,8 @@ each of them:
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     new, drop = add_verbs(parser, VERBS).values()
-    flags(new)("file", "FILE", "key file to write, with mode 0600")
-    flags(drop)("file", "FILE", "key file made by 'new'")
+    new.add_argument("file", type=Path, metavar="FILE", help="key file to write, with mode 0600")
+    drop.add_argument("file", type=Path, metavar="FILE", help="key file made by 'new'")
 
 
 def execute(options: Options) -> None:

@@ -6,9 +6,10 @@ from __future__ import annotations
 
 import os
 import sys
+from pathlib import Path
 
 from cloudrc.cli.output import print_lines, tell
-from cloudrc.cli.parser import Options, Parser, flags, number, settings_from, whole_number
+from cloudrc.cli.parser import Options, Parser, number, settings_from, whole_number
 from cloudrc.cli.relay import link_arguments
 
 EPILOG = """\
@@ -42,17 +43,23 @@ HIDING = "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST", "ROS_LOCALHOST_ONLY=1"
 def arguments(parser: Parser) -> None:
     """Declare the action's arguments."""
     link_arguments(parser)
-    add = flags(parser)
-    add("--server", "COMMAND", "the program that serves", required=True)
-    add("--client", "COMMAND", "the program that asks", required=True)
+    parser.add_argument(
+        "--server", required=True, metavar="COMMAND", help="the program that serves"
+    )
+    parser.add_argument("--client", required=True, metavar="COMMAND", help="the program that asks")
     port = whole_number(1, 65535)
-    expose = "forward this TCP port of 127.0.0.1 to the server, beside the link; repeatable"
-    add("--expose", "PORT", expose, read=port, many=True)
-    wait = "longest time for the server to listen (default: 60); 0: start the client at once"
-    add("--wait", "S", wait, 60.0, number(0, 3600, "seconds"))
-    add("--metrics-port", "PORT", "serve Prometheus metrics at this port of 127.0.0.1", read=port)
-    output = "new folder for link.json and the recordings of both directions"
-    add("-o --output", "FOLDER", output)
+    about = "forward this TCP port of 127.0.0.1 to the server, beside the link; repeatable"
+    parser.add_argument(
+        "--expose", action="append", type=port, default=[], metavar="PORT", help=about
+    )
+    about = "longest time for the server to listen (default: 60); 0: start the client at once"
+    parser.add_argument(
+        "--wait", type=number(0, 3600, "seconds"), default=60.0, metavar="S", help=about
+    )
+    about = "serve Prometheus metrics at this port of 127.0.0.1"
+    parser.add_argument("--metrics-port", type=port, metavar="PORT", help=about)
+    about = "new folder for link.json and the recordings of both directions"
+    parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help=about)
 
 
 def _warn_of_hidden_nodes(*commands: str) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cloudrc.cli.parser import Options, Parser, flags
+from cloudrc.cli.parser import Options, Parser
 from cloudrc.errors import BadInputError
 from cloudrc.outside.paths import check_new
 
@@ -39,12 +39,15 @@ writes both, and adds the direction to each file name."""
 
 def arguments(parser: Parser) -> None:
     """Declare the action's arguments."""
-    add = flags(parser)
-    add("source", "SOURCE", "a run, a log or a CSV file", read=Path)
-    add("-o --output", "FILE", "the trace to write", required=True)
-    add("--direction", None, "take this direction only", choices=("uplink", "downlink"))
-    halve = "take half of each round trip of a log; correct only if both directions are equal"
-    add("--halve-rtt", "", halve)
+    parser.add_argument("source", type=Path, metavar="SOURCE", help="a run, a log or a CSV file")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE", help="the trace to write"
+    )
+    parser.add_argument(
+        "--direction", choices=("uplink", "downlink"), help="take this direction only"
+    )
+    about = "take half of each round trip of a log; correct only if both directions are equal"
+    parser.add_argument("--halve-rtt", action="store_true", help=about)
 
 
 def execute(options: Options) -> None:

@@ -10,7 +10,7 @@ from time import monotonic
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import output_argument, print_result, tell
-from cloudrc.cli.parser import Options, Parser, flags
+from cloudrc.cli.parser import Options, Parser
 from cloudrc.cli.where import find_local_run, need_release, release_arguments, run_argument
 from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.errors import MissingPrerequisiteError
@@ -42,7 +42,7 @@ def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     about = "uplink.KEY=VALUE or downlink.KEY=VALUE"
     parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help=about)
-    flags(parser)("--profile", "NAME", "shipped profile, or a file")
+    parser.add_argument("--profile", metavar="NAME", help="shipped profile, or a file")
     run_argument(parser)
     output_argument(parser)
     release_arguments(parser)

@@ -10,7 +10,6 @@ from cloudrc.cli.output import tell
 from cloudrc.cli.parser import (
     Options,
     Parser,
-    flags,
     number,
     read_seed,
     settings_from,
@@ -37,16 +36,23 @@ with losses between 0 and 1 has several."""
 
 def arguments(parser: Parser) -> None:
     """Declare the arguments."""
-    add = flags(parser)
-    add("profile", "PROFILE", "shipped profile, a file, or a trace in CSV")
-    picture = "the picture: .png, .svg or .pdf (default: NAME.png)"
-    add("-o --output", "FILE", picture)
-    seconds = "time to show (default: 30, or the whole time line)"
-    add("--seconds", "S", seconds, read=number(0.001, 86_400, "seconds"))
-    add("--seed", "S", "seed of the random draws (default: 1)", 1, read_seed)
-    add("--rate", "HZ", "packets per second (default: 100)", 100.0, number(1, 10_000, "Hz"))
-    packets = "packets for the statistics of an unchanging link (default: 100000)"
-    add("--packets", "N", packets, 100_000, whole_number(1, PACKETS_MAX))
+    parser.add_argument(
+        "profile", metavar="PROFILE", help="shipped profile, a file, or a trace in CSV"
+    )
+    about = "the picture: .png, .svg or .pdf (default: NAME.png)"
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help=about)
+    about = "time to show (default: 30, or the whole time line)"
+    parser.add_argument("--seconds", type=number(0.001, 86_400, "seconds"), metavar="S", help=about)
+    about = "seed of the random draws (default: 1)"
+    parser.add_argument("--seed", type=read_seed, default=1, metavar="S", help=about)
+    about = "packets per second (default: 100)"
+    parser.add_argument(
+        "--rate", type=number(1, 10_000, "Hz"), default=100.0, metavar="HZ", help=about
+    )
+    about = "packets for the statistics of an unchanging link (default: 100000)"
+    parser.add_argument(
+        "--packets", type=whole_number(1, PACKETS_MAX), default=100_000, metavar="N", help=about
+    )
 
 
 def execute(options: Options) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import output_argument, paint, print_result
-from cloudrc.cli.parser import Options, Parser, flags, number
+from cloudrc.cli.parser import Options, Parser, number
 from cloudrc.cli.where import flown_release, release_arguments
 from cloudrc.errors import BadInputError
 from cloudrc.link.verify import DEFAULT
@@ -37,22 +37,25 @@ exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
 
 def arguments(parser: Parser) -> None:
     """Declare the arguments."""
-    add = flags(parser)
-    target = f"name of a shipped one, or a file (default: {DEFAULT})"
-    add("target", "PROFILE|EXPERIMENT", target, DEFAULT, nargs="?")
-    setting = "override one value of the experiment, for example link.uplink.loss=0.1"
-    add("--set", "KEY=VALUE", setting, dest="settings")
-    seconds = (
+    about = f"name of a shipped one, or a file (default: {DEFAULT})"
+    parser.add_argument(
+        "target", nargs="?", default=DEFAULT, metavar="PROFILE|EXPERIMENT", help=about
+    )
+    about = "override one value of the experiment, for example link.uplink.loss=0.1"
+    parser.add_argument(
+        "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help=about
+    )
+    about = (
         "time to send probes (default: as long as needed, at most 120); with --mode cluster: "
         "time to wait for a verdict (default: 270)"
     )
-    add("--seconds", "S", seconds, read=number(1, 3600, "seconds"))
-    shaper = "relay (default), or netem between two network namespaces (needs root)"
-    add("--shaper", None, shaper, "relay", choices=("relay", "netem"))
-    mode = "a link started on this machine (default), or the link of a release"
-    add("--mode", None, mode, "local", choices=("local", "cluster"))
-    ends = "hosts of a release's two pods, from inside its cluster; used by 'helm test'"
-    add("--ends", "WORLD,CLOUD", ends)
+    parser.add_argument("--seconds", type=number(1, 3600, "seconds"), metavar="S", help=about)
+    about = "relay (default), or netem between two network namespaces (needs root)"
+    parser.add_argument("--shaper", choices=("relay", "netem"), default="relay", help=about)
+    about = "a link started on this machine (default), or the link of a release"
+    parser.add_argument("--mode", choices=("local", "cluster"), default="local", help=about)
+    about = "hosts of a release's two pods, from inside its cluster; used by 'helm test'"
+    parser.add_argument("--ends", metavar="WORLD,CLOUD", help=about)
     release_arguments(parser)
     output_argument(parser)
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from cloudrc.cli.output import output_argument, paint, print_result, tell
-from cloudrc.cli.parser import Options, Parser, flags
+from cloudrc.cli.parser import Options, Parser
 from cloudrc.cli.where import cluster_arguments, release_from_flags
 from cloudrc.runs.catalogue import KINDS, as_text, describe_all
 
@@ -22,7 +22,7 @@ def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     about = f"one of {', '.join(KINDS)}; or {RELEASES}, those of a cluster"
     choices = (*KINDS, RELEASES)
-    flags(parser)("what", "WHAT", about, nargs="?", choices=choices)
+    parser.add_argument("what", nargs="?", choices=choices, metavar="WHAT", help=about)
     output_argument(parser)
     cluster_arguments(parser, "of the releases (default: all)")
 

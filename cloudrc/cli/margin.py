@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.compare import flight_arguments
 from cloudrc.cli.output import output_argument, print_result, warn_of_few_seeds
-from cloudrc.cli.parser import Options, Parser, flags, number
+from cloudrc.cli.parser import Options, Parser, number
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
@@ -32,14 +32,13 @@ delays need it, unless --set gives them."""
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = flags(parser)
-    add("key", "KEY", "key of the experiment whose value is a number")
+    parser.add_argument("key", metavar="KEY", help="key of the experiment whose value is a number")
     flight_arguments(parser, seeds=3)
     above_0 = number(1e-9, 1e12, "units")
     about = "largest value to try (default: 32 times the first, which is the present one)"
-    add("--max", "X", about, read=above_0)
+    parser.add_argument("--max", type=above_0, metavar="X", help=about)
     about = "try multiples of R (default: 10 for a key in ms, 1 for whole numbers, else 0.01)"
-    add("--resolution", "R", about, read=above_0)
+    parser.add_argument("--resolution", type=above_0, metavar="R", help=about)
     output_argument(parser)
 
 

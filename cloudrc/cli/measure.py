@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 
 from cloudrc.cli.output import print_line, tell
-from cloudrc.cli.parser import Options, Parser, add_verbs, flags, number
+from cloudrc.cli.parser import Options, Parser, add_verbs, number, set_argument
 from cloudrc.drivers.machine import usable_cores
 from cloudrc.errors import BadInputError
 from cloudrc.outside.paths import check_new
@@ -36,13 +36,19 @@ def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     (compute,) = add_verbs(parser, VERBS).values()
     compute.epilog = EPILOG
-    add = flags(compute)
-    add("what", "CONTROLLER|RUN", "name or file of a controller, or the folder of a run")
+    about = "name or file of a controller, or the folder of a run"
+    compute.add_argument("what", metavar="CONTROLLER|RUN", help=about)
     about = "limit of processors, such as 0.2; it needs the permission to make a control group"
-    add("--cpus", "N", about, read=number(0.01, 64, "processors"))
-    add("--seconds", "S", "longest duration (default: 20)", 20.0, number(1, 3600, "seconds"))
-    add("--set", "KEY=VALUE", "change one key of the experiment; repeatable")
-    add("--out", "FILE", "new file (default: compute.txt)", Path("compute.txt"))
+    compute.add_argument("--cpus", type=number(0.01, 64, "processors"), metavar="N", help=about)
+    about = "longest duration (default: 20)"
+    compute.add_argument(
+        "--seconds", type=number(1, 3600, "seconds"), default=20.0, metavar="S", help=about
+    )
+    set_argument(compute)
+    about = "new file (default: compute.txt)"
+    compute.add_argument(
+        "--out", type=Path, default=Path("compute.txt"), metavar="FILE", help=about
+    )
 
 
 def execute(options: Options) -> None:

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from math import inf
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -30,7 +31,6 @@ from cloudrc.cli.parser import (
     Options,
     Parser,
     add_verbs,
-    flags,
     number,
     read_size,
     whole_number,
@@ -113,56 +113,71 @@ def arguments(parser: Parser) -> None:
             run_argument(verb)
             release_arguments(verb)
     run, fly = verbs["run"], verbs["fly"]
-    flags(run)("mission", "FILE", "mission file, or name of a shipped mission", read=str)
+    run.add_argument("mission", metavar="FILE", help="mission file, or name of a shipped mission")
     timeout_argument(run)
-    flags(run)("--name", None, "name shown to people (default: the file's name)", "")
-    flags(run)("--detach", "", "return once the mission is posted; follow it by 'mission attach'")
-    add = flags(fly)
-    add("--mission", "FILE", "mission file", read=str, required=True)
-    add("--key", None, "a mission posted twice under one key flies once", "")
-    lease = f"seconds that the mission flies on after the end of this command (default: {LEASE:g})"
-    add("--lease", "S", lease, LEASE, number(5, 3600, "seconds"))
-    together = "Unix time at which to post it: the robots of a fleet begin together"
-    add("--at", "T", together, 0.0, number(0, 1e11, "seconds"))
+    run.add_argument("--name", default="", help="name shown to people (default: the file's name)")
+    about = "return once the mission is posted; follow it by 'mission attach'"
+    run.add_argument("--detach", action="store_true", help=about)
+    fly.add_argument("--mission", required=True, metavar="FILE", help="mission file")
+    fly.add_argument("--key", default="", help="a mission posted twice under one key flies once")
+    about = f"seconds that the mission flies on after the end of this command (default: {LEASE:g})"
+    fly.add_argument(
+        "--lease", type=number(5, 3600, "seconds"), default=LEASE, metavar="S", help=about
+    )
+    about = "Unix time at which to post it: the robots of a fleet begin together"
+    fly.add_argument("--at", type=number(0, 1e11, "seconds"), default=0.0, metavar="T", help=about)
     _keep_arguments(fly)
     for verb in (run, fly):
-        flags(verb)("--queue", "", "wait for the current mission to end")
+        verb.add_argument(
+            "--queue", action="store_true", help="wait for the current mission to end"
+        )
     for name in ("list", "status"):
         output_argument(verbs[name])
     ids = {"status": "show the robot", "cancel": "the current one", "logs": "all"}
     for name, default in ids.items():
-        flags(verbs[name])("id", "ID", f"mission (default: {default})", nargs="?")
+        verbs[name].add_argument(
+            "id", nargs="?", metavar="ID", help=f"mission (default: {default})"
+        )
     about = "mission, or Job of 'mission run' (default: the last Job, or the current mission)"
-    flags(verbs["attach"])("id", "ID|JOB", about, nargs="?")
-    flags(verbs["logs"])("-f --follow", "", "keep printing new events")
-    add, about, metres = flags(verbs["goto"]), "[m], world frame", number(-1000, 1000, "metres")
-    add("x", "X", about, read=metres)
-    add("y", "Y", about, read=metres)
-    add("z", "Z", f"{about}; none for a robot on the ground", read=metres, nargs="?")
+    verbs["attach"].add_argument("id", nargs="?", metavar="ID|JOB", help=about)
+    verbs["logs"].add_argument(
+        "-f", "--follow", action="store_true", help="keep printing new events"
+    )
+    goto, about, metres = verbs["goto"], "[m], world frame", number(-1000, 1000, "metres")
+    goto.add_argument("x", type=metres, metavar="X", help=about)
+    goto.add_argument("y", type=metres, metavar="Y", help=about)
+    about += "; none for a robot on the ground"
+    goto.add_argument("z", nargs="?", type=metres, metavar="Z", help=about)
     about = "heading there [deg], for a robot that can turn"
-    add("--yaw", "DEG", about, read=number(-360, 360, "degrees"))
+    goto.add_argument("--yaw", type=number(-360, 360, "degrees"), metavar="DEG", help=about)
 
 
 def _report_arguments(parser: Parser) -> None:
-    add = flags(parser)
-    add("where", "RELEASE", "the release (default: the only one of the namespace)", nargs="?")
+    about = "the release (default: the only one of the namespace)"
+    parser.add_argument("where", nargs="?", metavar="RELEASE", help=about)
     about = "id of the mission, such as m3, or name of a kept report (default: the last mission)"
-    add("mission", "MISSION", about, "", nargs="?")
-    add("--out", "DIR", "folder of the report (default: a new one in runs/)")
+    parser.add_argument("mission", nargs="?", default="", metavar="MISSION", help=about)
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder of the report (default: a new one in runs/)"
+    )
     output_argument(parser)
     release_arguments(parser)
 
 
 def _keep_arguments(fly: Parser) -> None:
     """Declare the arguments of a Job that keeps a report in the volume of the recordings."""
-    add = flags(fly)
-    add("--report", "DIR", "keep a report of the mission beside the recordings in this folder")
-    add("--config", "FILE", "experiment file of the release")
-    add("--profile", "FILE", "profile of its link")
-    add("--keep", "N", "largest number of reports (default: 100)", 100, whole_number(1, 10**6))
+    about = "keep a report of the mission beside the recordings in this folder"
+    fly.add_argument("--report", type=Path, metavar="DIR", help=about)
+    fly.add_argument("--config", type=Path, metavar="FILE", help="experiment file of the release")
+    fly.add_argument("--profile", type=Path, metavar="FILE", help="profile of its link")
+    about = "largest number of reports (default: 100)"
+    fly.add_argument("--keep", type=whole_number(1, 10**6), default=100, metavar="N", help=about)
     about = "largest age of a report in days (default: 30)"
-    add("--keep-days", "DAYS", about, 30.0, number(1e-3, 1e5, "days"))
-    add("--keep-size", "SIZE", "largest size of all reports, such as 1Gi", inf, read_size)
+    fly.add_argument(
+        "--keep-days", type=number(1e-3, 1e5, "days"), default=30.0, metavar="DAYS", help=about
+    )
+    about = "largest size of all reports, such as 1Gi"
+    fly.add_argument("--keep-size", type=read_size, default=inf, metavar="SIZE", help=about)
 
 
 def execute(options: Options) -> int | None:

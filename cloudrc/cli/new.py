@@ -4,9 +4,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from shlex import quote
 
-from cloudrc.cli.parser import Options, Parser, add_verbs, flags
+from cloudrc.cli.parser import Options, Parser, add_verbs
 
 VERBS = {"robot": "write a folder with a robot that flies, to change"}
 EPILOG = """\
@@ -18,7 +19,7 @@ examples:
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     (robot,) = add_verbs(parser, VERBS).values()
-    flags(robot)("folder", "DIR", "folder for the files")
+    robot.add_argument("folder", type=Path, metavar="DIR", help="folder for the files")
 
 
 def execute(options: Options) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from cloudrc.cli.parser import Parser, flags
+from cloudrc.cli.parser import Parser
 from cloudrc.errors import DISK_FULL
 from cloudrc.files import at_place
 from cloudrc.text import escape
@@ -43,7 +43,7 @@ def output_argument(
 ) -> None:
     """Declare the flag `--output`; `what` is its help text, `forms` are further forms."""
     forms, about = (TABLE, "json", "yaml", *forms), f"{what} (default: table)"
-    flags(parser)("-o --output", None, about, TABLE, choices=forms)
+    parser.add_argument("-o", "--output", choices=forms, default=TABLE, help=about)
 
 
 def format_document(document: object, form: str) -> str:

@@ -100,10 +100,6 @@ exit codes: 0 done, 1 mission failed its criteria, 2 usage or bad input,
 Settings = TypeVar("Settings")
 Options = argparse.Namespace
 """What the user has given: an attribute per argument."""
-Add = Callable[..., argparse.Action]
-"""Function that declares an argument; `flags` returns it."""
-PATHS = ("FILE", "DIR", "FOLDER", "RUN", "RUN|RELEASE")
-"""Names of values that are paths."""
 
 
 class Arguments(Protocol):
@@ -135,9 +131,8 @@ class Parser(argparse.ArgumentParser):
         raise BadInputError(f"{message}; see '{self.prog} --help'")
 
     def add_argument(self, *names: Any, **given: Any) -> argparse.Action:
-        """Declare an argument."""
-        self.declared.append(super().add_argument(*names, **given))
-        return self.declared[-1]
+        """Declare an argument; an error of its `choices` suggests the most similar one."""
+        return self._declare(super().add_argument, *names, **given)
 
     def add_argument_group(self, *about: Any, **given: Any) -> Any:
         """Begin a group of arguments."""
@@ -149,14 +144,16 @@ class Parser(argparse.ArgumentParser):
 
     def _noted(self, group: Any) -> Any:
         """Let `declared` have the arguments of a group, too."""
-        declare = group.add_argument
-
-        def add_argument(*names: str, **given: Any) -> argparse.Action:
-            self.declared.append(declare(*names, **given))
-            return self.declared[-1]
-
-        group.add_argument = add_argument
+        group.add_argument = partial(self._declare, group.add_argument)
         return group
+
+    def _declare(
+        self, add_argument: Callable[..., argparse.Action], *names: str, **given: Any
+    ) -> argparse.Action:
+        if "choices" in given:
+            given["type"] = _one_of([*given["choices"]])
+        self.declared.append(add_argument(*names, **given))
+        return self.declared[-1]
 
     def add_subparsers(self, **given: Any) -> Any:
         """Begin the verbs, or the commands."""
@@ -206,6 +203,17 @@ def number(low: float, high: float, unit: str) -> NumberFlag:
     return NumberFlag(Quantity(unit, low, high))
 
 
+def _one_of(choices: list[str]) -> Callable[[str], str]:
+    """Return a type for argparse: a choice; its error suggests the most similar one."""
+
+    def read(text: str) -> str:
+        if text not in choices:
+            raise argparse.ArgumentTypeError(unknown_name_text("choice", text, choices))
+        return text
+
+    return read
+
+
 def read_list(read: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
     """Return a function that reads different values between commas, each by `read`."""
     return lambda text: tuple(dict.fromkeys(read(each.strip()) for each in text.split(",")))
@@ -221,58 +229,20 @@ def read_size(text: str) -> float:
     return float(number) * (1024.0 if binary else 1000.0) ** power
 
 
-def flags(parser: Arguments) -> Add:
-    """Return a function that declares an argument: `add(name, value, text, default, read)`.
-
-    A `name` may be two, such as "-n --namespace". `value` names the value in the help: with "" the
-    argument is a flag without a value, with None it has `choices`. A value named in `PATHS` is a
-    path; KEY=VALUE, and an argument with `many`, may be repeated. `text` is the help, `read`
-    converts a text. Others are those of argparse.
-    """
-    return partial(_declare, parser)
-
-
-def _declare(
-    parser: Arguments,
-    name: str,
-    value: str | None,
-    text: str,
-    default: object = None,
-    read: Any = None,
-    *,
-    many: bool = False,
-    **others: Any,
-) -> argparse.Action:
-    if value == "":
-        return parser.add_argument(*name.split(), action="store_true", help=text)
-    if many or value == "KEY=VALUE":
-        others["action"], default = "append", []
-    if "choices" in others:
-        read = _one_of([*others["choices"]])
-    read = read or (Path if value in PATHS else None)
-    return parser.add_argument(
-        *name.split(), metavar=value, help=text, default=default, type=read, **others
-    )
-
-
-def _one_of(choices: list[str]) -> Callable[[str], str]:
-    """Return a type for argparse: a choice; it suggests the most similar one for another text."""
-
-    def read(text: str) -> str:
-        if text not in choices:
-            raise argparse.ArgumentTypeError(unknown_name_text("choice", text, choices))
-        return text
-
-    return read
+def set_argument(parser: Arguments) -> None:
+    """Declare `--set`, which changes keys of the experiment."""
+    about = "change one key of the experiment; repeatable"
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
 
 
 def figure_arguments(parser: Parser, width: float) -> None:
     """Declare the arguments for the size of figures; `width` is the default width [in]."""
-    add = flags(parser)
     about = f"width of figures in inches: one column of a paper has 3.5 (default: {width})"
-    add("--width", "IN", about, width, number(2, 20, "inches"))
+    inches = number(2, 20, "inches")
+    parser.add_argument("--width", type=inches, default=width, metavar="IN", help=about)
     about = "size of the text of figures in points (default: 9)"
-    add("--font-size", "PT", about, 9.0, number(5, 24, "points"))
+    points = number(5, 24, "points")
+    parser.add_argument("--font-size", type=points, default=9.0, metavar="PT", help=about)
 
 
 class _Version(argparse.Action):
@@ -298,9 +268,8 @@ def build_parser(wanted: Container[str]) -> Parser:
         description="\n\n".join([ABOUT, *map(_lines, GROUPS)]),
         epilog=EXAMPLES,
     )
-    parser.add_argument(
-        "--version", action=_Version, nargs=0, help="print version and hash of the code"
-    )
+    about = "print version and hash of the code"
+    parser.add_argument("--version", action=_Version, nargs=0, help=about)
     commands = parser.add_subparsers(dest="command", help=argparse.SUPPRESS, prog=typed)
     for name, line in COMMANDS.items():
         command = commands.add_parser(name, help=line, description=_sentence(line))

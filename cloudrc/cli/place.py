@@ -4,15 +4,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from cloudrc.cli.output import TABLE, again, output_argument, print_result, tell, warn
 from cloudrc.cli.parser import (
     COUNT_MAX,
     Options,
     Parser,
-    flags,
     number,
     read_count,
     read_list,
+    set_argument,
     settings_from,
 )
 from cloudrc.runs.folder import results_folder
@@ -35,19 +37,28 @@ flies."""
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = flags(parser)
     about = "a shipped name or a YAML file (default: fast)"
-    add("experiment", "EXPERIMENT", about, "fast", nargs="?")
+    parser.add_argument("experiment", nargs="?", default="fast", metavar="EXPERIMENT", help=about)
+    times = read_list(number(0, 1000, "ms"))
     about = "computing times of a command in ms (default: 0,5,20,60)"
-    add("--compute", "MS,...", about, "0,5,20,60", read_list(number(0, 1000, "ms")))
-    add("--robots", "N,...", "numbers of robots (default: 1)", "1", read_list(read_count))
-    about = "shipped places or YAML files (default: onboard,edge,cloud)"
-    add("--places", "PLACE,...", about, "onboard,edge,cloud", read_list(str))
-    add("--set", "KEY=VALUE", "change one key of the experiment; repeatable")
-    add("--seeds", "N", "fly seeds 1 to N (default: 6)", 6, read_count)
-    add("--calm", "", "fly without wind and without a payload")
-    add("--jobs", "N", "parallel processes (default: one per core)", COUNT_MAX, read_count)
-    add("--out", "DIR", "folder (default: a new one in runs/); if it has rows, fly the others")
+    parser.add_argument("--compute", type=times, default="0,5,20,60", metavar="MS,...", help=about)
+    counts, names = read_list(read_count), read_list(str)
+    about = "numbers of robots (default: 1)"
+    parser.add_argument("--robots", type=counts, default="1", metavar="N,...", help=about)
+    shipped = "onboard,edge,cloud"
+    about = f"shipped places or YAML files (default: {shipped})"
+    parser.add_argument("--places", type=names, default=shipped, metavar="PLACE,...", help=about)
+    set_argument(parser)
+    parser.add_argument(
+        "--seeds", type=read_count, default=6, metavar="N", help="fly seeds 1 to N (default: 6)"
+    )
+    parser.add_argument(
+        "--calm", action="store_true", help="fly without wind and without a payload"
+    )
+    about = "parallel processes (default: one per core)"
+    parser.add_argument("--jobs", type=read_count, default=COUNT_MAX, metavar="N", help=about)
+    about = "folder (default: a new one in runs/); if it has rows, fly the others"
+    parser.add_argument("--out", type=Path, metavar="DIR", help=about)
     output_argument(parser)
 
 

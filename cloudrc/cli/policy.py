@@ -6,9 +6,10 @@ from __future__ import annotations
 
 import os
 import sys
+from pathlib import Path
 
 from cloudrc.cli.output import print_line, tell
-from cloudrc.cli.parser import Options, Parser, add_verbs, flags, whole_number
+from cloudrc.cli.parser import Options, Parser, add_verbs, whole_number
 from cloudrc.cli.processes import number_argument
 from cloudrc.drivers.openpi import KEY_VARIABLE
 from cloudrc.drivers.process import StopSignal
@@ -32,17 +33,22 @@ API key."""
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     serve, drive = add_verbs(parser, VERBS).values()
-    add = flags(serve)
-    add("policy", "POLICY", "a Python file with infer(observation)")
-    add("--host", "HOST", "address to listen at (default: 127.0.0.1)", "127.0.0.1")
+    serve.add_argument("policy", metavar="POLICY", help="a Python file with infer(observation)")
+    about = "address to listen at (default: 127.0.0.1)"
+    serve.add_argument("--host", default="127.0.0.1", metavar="HOST", help=about)
     about = "port to listen at; 0: any free port (default: 8000)"
-    add("--port", "N", about, 8000, whole_number(0, 65_535))
+    serve.add_argument(
+        "--port", type=whole_number(0, 65_535), default=8000, metavar="N", help=about
+    )
 
-    add = flags(drive)
-    add("--config", "FILE", "experiment file (YAML)", required=True)
-    add("--socket", "DIR", "folder of the sockets of 'cloudrc cloud --teleop DIR'", required=True)
+    drive.add_argument(
+        "--config", type=Path, required=True, metavar="FILE", help="experiment file (YAML)"
+    )
+    about = "folder of the sockets of 'cloudrc cloud --teleop DIR'"
+    drive.add_argument("--socket", type=Path, required=True, metavar="DIR", help=about)
     number_argument(drive)
-    add("--feed", "", "write status for a supervisor to stdout (default: events only)")
+    about = "write status for a supervisor to stdout (default: events only)"
+    drive.add_argument("--feed", action="store_true", help=about)
 
 
 def execute(options: Options) -> None:

@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import argparse
 import socket
+from pathlib import Path
 from types import SimpleNamespace
 
 from cloudrc.cli.parser import (
     Arguments,
     Options,
     Parser,
-    flags,
     read_size,
     settings_from,
     whole_number,
@@ -30,40 +30,46 @@ def process_arguments(parser: Parser) -> None:
 def number_argument(parser: Arguments) -> None:
     """Declare the flag of processes that work for one robot of a fleet."""
     about = "number in the experiment's fleet (default: no fleet)"
-    flags(parser)("--robot", "K", about, read=whole_number(0, 999))
+    parser.add_argument("--robot", type=whole_number(0, 999), metavar="K", help=about)
 
 
 def status_arguments(parser: Parser) -> None:
     """Declare the flags that all processes have in common."""
-    add = flags(parser)
-    add("--config", "FILE", "experiment file (YAML)", required=True)
-    add("--feed", "", "write status for a supervisor to stdout (default: events only)")
+    parser.add_argument(
+        "--config", type=Path, required=True, metavar="FILE", help="experiment file (YAML)"
+    )
+    about = "write status for a supervisor to stdout (default: events only)"
+    parser.add_argument("--feed", action="store_true", help=about)
     about = "serve metrics and health checks here (default: off)"
-    add("--metrics", "HOST:PORT", about, read=read_address)
+    parser.add_argument("--metrics", type=read_address, metavar="HOST:PORT", help=about)
 
 
 def _end_arguments(parser: Parser) -> None:
     process_arguments(parser)
-    add = flags(parser)
-    file = "MCAP file to record to; an existing one becomes NAME.before.mcap"
-    add("--record", "FILE", file, required=True)
-    add("--record-flights", "", "no periodic records while the robot does not fly")
-    size = "limit of both files, such as 500M or 1Gi; at 45 %% the recording begins anew"
-    add("--record-max", "SIZE", size, read=read_size)
-    add("--listen", "HOST:PORT", "address to receive at", read=read_address, required=True)
-    add("--key", "FILE", "the tunnel's key ('cloudrc key new FILE')", required=True)
-    route = "the link's file with the address to send to; the link's state is beside it"
-    add("--route", "FILE", route, required=True)
-    peer = "where to send without a link process; to robot 0's PORT, the number is added"
-    add("--peer", "HOST:PORT", peer, read=read_address)
+    about = "MCAP file to record to; an existing one becomes NAME.before.mcap"
+    parser.add_argument("--record", type=Path, required=True, metavar="FILE", help=about)
+    about = "no periodic records while the robot does not fly"
+    parser.add_argument("--record-flights", action="store_true", help=about)
+    about = "limit of both files, such as 500M or 1Gi; at 45 %% the recording begins anew"
+    parser.add_argument("--record-max", type=read_size, metavar="SIZE", help=about)
+    about = "address to receive at"
+    parser.add_argument(
+        "--listen", type=read_address, required=True, metavar="HOST:PORT", help=about
+    )
+    about = "the tunnel's key ('cloudrc key new FILE')"
+    parser.add_argument("--key", type=Path, required=True, metavar="FILE", help=about)
+    about = "the link's file with the address to send to; the link's state is beside it"
+    parser.add_argument("--route", type=Path, required=True, metavar="FILE", help=about)
+    about = "where to send without a link process; to robot 0's PORT, the number is added"
+    parser.add_argument("--peer", type=read_address, metavar="HOST:PORT", help=about)
 
 
 def _cloud_arguments(parser: Parser) -> None:
     _end_arguments(parser)
-    add = flags(parser)
-    add("--teleop", "DIR", "folder of the sockets of 'cloudrc teleop --socket DIR'", required=True)
-    text = "folder of the sockets of programs that read cloud's records (default: that of teleop)"
-    add("--records", "DIR", text)
+    about = "folder of the sockets of 'cloudrc teleop --socket DIR'"
+    parser.add_argument("--teleop", type=Path, required=True, metavar="DIR", help=about)
+    about = "folder of the sockets of programs that read cloud's records (default: that of teleop)"
+    parser.add_argument("--records", type=Path, metavar="DIR", help=about)
 
 
 def read_address(text: str) -> Address:

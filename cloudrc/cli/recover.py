@@ -8,7 +8,7 @@ from collections import Counter
 from pathlib import Path
 
 from cloudrc.cli.output import output_argument, print_result
-from cloudrc.cli.parser import Options, Parser, flags
+from cloudrc.cli.parser import Options, Parser
 from cloudrc.errors import BadInputError
 from cloudrc.outside.paths import check_new
 from cloudrc.text import escape
@@ -24,10 +24,9 @@ exit codes: 0 copied, and what is missing is printed, 2 nothing readable, or
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = flags(parser)
-    add("file", "FILE", "a recording (.mcap)")
+    parser.add_argument("file", type=Path, metavar="FILE", help="a recording (.mcap)")
     about = "file for the clean copy (default: FILE with '.recovered' before its ending)"
-    add("-t --to", "NEW", about, read=Path)
+    parser.add_argument("-t", "--to", type=Path, metavar="NEW", help=about)
     output_argument(parser)
 
 

@@ -4,10 +4,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.output import output_argument, print_result, tell
-from cloudrc.cli.parser import Options, Parser, add_verbs, flags, read_seed, settings_from
+from cloudrc.cli.parser import Options, Parser, add_verbs, read_seed, settings_from
 from cloudrc.cli.processes import read_address
 from cloudrc.errors import BadInputError
 
@@ -55,31 +56,38 @@ def arguments(parser: Parser) -> None:
     verbs = add_verbs(parser, VERBS)
     tcp, ros = verbs["tcp"], verbs["ros"]
     tcp.epilog, ros.epilog = TCP_EPILOG, ROS_EPILOG
-    add = flags(tcp)
-    add("--listen", "HOST:PORT", "where clients connect", read=read_address, required=True)
-    add("--to", "HOST:PORT", "the server", read=read_address, required=True)
+    about = "where clients connect"
+    tcp.add_argument("--listen", type=read_address, required=True, metavar="HOST:PORT", help=about)
+    tcp.add_argument(
+        "--to", type=read_address, required=True, metavar="HOST:PORT", help="the server"
+    )
     link_arguments(tcp)
     output_argument(tcp)
-    add = flags(ros)
-    add("--from", "TOPIC", "topic to hear", required=True, dest="source")
-    add("--to", "TOPIC", "topic to publish", required=True)
-    way = "direction of the profile that the messages take (default: uplink)"
-    add("--direction", None, way, "uplink", choices=("uplink", "downlink"))
-    add("--reliable", "", "publish RELIABLE (default: BEST_EFFORT)")
+    ros.add_argument("--from", dest="source", required=True, metavar="TOPIC", help="topic to hear")
+    ros.add_argument("--to", required=True, metavar="TOPIC", help="topic to publish")
+    about = "direction of the profile that the messages take (default: uplink)"
+    ros.add_argument("--direction", choices=("uplink", "downlink"), default="uplink", help=about)
+    ros.add_argument(
+        "--reliable", action="store_true", help="publish RELIABLE (default: BEST_EFFORT)"
+    )
     link_arguments(ros)
     output_argument(ros)
-    stream = "name of the link; links with one seed and other names draw other numbers"
-    add("--stream", "NAME", stream, "")
-    add("--out", "FOLDER", "new folder for link.json and the recording of the messages")
+    about = "name of the link; links with one seed and other names draw other numbers"
+    ros.add_argument("--stream", default="", metavar="NAME", help=about)
+    about = "new folder for link.json and the recording of the messages"
+    ros.add_argument("--out", type=Path, metavar="FOLDER", help=about)
 
 
 def link_arguments(parser: Parser) -> None:
     """Declare the arguments that choose an emulated link."""
-    add = flags(parser)
-    add("--link", "PROFILE", "shipped profile, or a file", "ideal")
-    setting = "change of the profile, such as uplink.loss=0.05; repeatable"
-    add("--set", "KEY=VALUE", setting, dest="settings")
-    add("--seed", "S", "seed (default: 1)", 1, read_seed)
+    parser.add_argument(
+        "--link", default="ideal", metavar="PROFILE", help="shipped profile, or a file"
+    )
+    about = "change of the profile, such as uplink.loss=0.05; repeatable"
+    parser.add_argument(
+        "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help=about
+    )
+    parser.add_argument("--seed", type=read_seed, default=1, metavar="S", help="seed (default: 1)")
 
 
 def execute(options: Options) -> None:

@@ -4,8 +4,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from cloudrc.cli.output import open_page, print_line, tell
-from cloudrc.cli.parser import Options, Parser, flags
+from cloudrc.cli.parser import Options, Parser
 from cloudrc.outside.paths import check_new
 
 EPILOG = """\
@@ -16,10 +18,10 @@ examples:
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = flags(parser)
-    add("run", "RUN", "folder of a run, or an MCAP file")
-    add("--out", "FILE", "file for the page (default: replay.html beside the recording)")
-    add("--no-open", "", "write the page, open no browser")
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or an MCAP file")
+    about = "file for the page (default: replay.html beside the recording)"
+    parser.add_argument("--out", type=Path, metavar="FILE", help=about)
+    parser.add_argument("--no-open", action="store_true", help="write the page, open no browser")
 
 
 def execute(options: Options) -> None:

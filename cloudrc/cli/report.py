@@ -12,7 +12,7 @@ from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.output import output_argument, paint, print_lines, print_result
-from cloudrc.cli.parser import Options, Parser, figure_arguments, flags
+from cloudrc.cli.parser import Options, Parser, figure_arguments
 from cloudrc.errors import BadInputError
 from cloudrc.text import escape
 
@@ -32,13 +32,12 @@ examples:
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = flags(parser)
-    add("run", "RUN", "the folder of a run")
+    parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run")
     about = (
         "also evaluate the metric in this Python file; repeatable. Files named by the run's"
         " configuration are never executed"
     )
-    add("--metric", "FILE", about, read=str, many=True)
+    parser.add_argument("--metric", action="append", default=[], metavar="FILE", help=about)
     files_argument(parser)
     figure_arguments(parser, 7.16)
     output_argument(parser)
@@ -47,14 +46,14 @@ def arguments(parser: Parser) -> None:
 def report_arguments(parser: Parser) -> None:
     """Declare the arguments that say which files a flight's report has."""
     about = "page: write report.html (default); none: the recording and report.json alone"
-    flags(parser)("--report", None, about, "page", choices=["page", "none"])
+    parser.add_argument("--report", choices=["page", "none"], default="page", help=about)
     files_argument(parser)
 
 
 def files_argument(parser: Parser) -> None:
     """Declare the argument for the files of the figures."""
     about = "also write each figure as PDF, PNG and SVG into the run's folder figures/"
-    flags(parser)("--figures", "", about)
+    parser.add_argument("--figures", action="store_true", help=about)
 
 
 def execute(options: Options) -> int:

@@ -4,11 +4,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from cloudrc.cli.output import (
     output_argument,
     print_result,
 )
-from cloudrc.cli.parser import Options, Parser, add_verbs, flags
+from cloudrc.cli.parser import Options, Parser, add_verbs
 from cloudrc.errors import BadInputError
 
 VERBS = {"check": "say what a robot is, fly it in virtual time, and say what must change"}
@@ -25,9 +27,9 @@ def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     (check,) = add_verbs(parser, VERBS).values()
     about = "a folder with robot.yaml, an .xml file, or the name of a shipped robot"
-    flags(check)("robot", "ROBOT", about)
+    check.add_argument("robot", metavar="ROBOT", help=about)
     about = "picture to write: .png, .svg or .pdf (default: check.png in a folder of yours)"
-    flags(check)("--picture", "FILE", about)
+    check.add_argument("--picture", type=Path, metavar="FILE", help=about)
     output_argument(check)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cloudrc.cli.output import print_line, tell
-from cloudrc.cli.parser import Options, Parser, add_verbs, flags
+from cloudrc.cli.parser import Options, Parser, add_verbs
 from cloudrc.cli.processes import number_argument
 from cloudrc.cli.where import api_arguments, given_token, need_run_here
 from cloudrc.errors import BadInputError
@@ -36,19 +36,24 @@ def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     bridge = add_verbs(parser, VERBS)["bridge"]
     bridge.epilog = EPILOG
-    add = flags(bridge)
     about = "folder of the flying run (default: the only one in flight in this folder)"
-    add("--run", "DIR", about)
+    bridge.add_argument("--run", type=Path, metavar="DIR", help=about)
     about = "namespace of topics and services, and prefix of the robot's frames (default: none)"
-    add("--namespace", "NAME", about, "", ros_namespace)
-    add("--observe", "", "let nodes see the robot, but not steer it")
-    add("--no-navigation", "", "leave the action navigate_to_pose to Nav2")
-    add("--rep-105", "", "let base_link move in the frame odom, and odom be a frame in map")
+    bridge.add_argument("--namespace", type=ros_namespace, default="", metavar="NAME", help=about)
+    bridge.add_argument(
+        "--observe", action="store_true", help="let nodes see the robot, but not steer it"
+    )
+    bridge.add_argument(
+        "--no-navigation", action="store_true", help="leave the action navigate_to_pose to Nav2"
+    )
+    about = "let base_link move in the frame odom, and odom be a frame in map"
+    bridge.add_argument("--rep-105", action="store_true", help=about)
     pod = bridge.add_argument_group("in the container of the chart")
-    add = flags(pod)
-    add("--config", "FILE", "experiment file")
+    pod.add_argument("--config", type=Path, metavar="FILE", help="experiment file")
     number_argument(pod)
-    add("--records", "DIR", "folder of 'cloudrc cloud --records DIR'")
+    pod.add_argument(
+        "--records", type=Path, metavar="DIR", help="folder of 'cloudrc cloud --records DIR'"
+    )
     api_arguments(pod, "the API of teleop; without a token, nodes cannot steer")
 
 

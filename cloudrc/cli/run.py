@@ -22,7 +22,7 @@ from cloudrc.cli.output import (
     tell,
     warn,
 )
-from cloudrc.cli.parser import Arguments, Options, Parser, flags, read_count, read_seed
+from cloudrc.cli.parser import Arguments, Options, Parser, read_count, read_seed, set_argument
 from cloudrc.cli.report import print_traceback, report_arguments, summary
 from cloudrc.cli.where import (
     DEFAULT_RELEASE,
@@ -70,11 +70,11 @@ def arguments(parser: Parser) -> None:
     many = parser.add_mutually_exclusive_group()
     experiment_arguments(parser, many)
     about = "where to fly (default: local; with --seeds or a fleet: virtual)"
-    add = flags(parser)
-    add("--mode", None, about, choices=MODES)
-    flags(many)("--seeds", "N", "fly seeds 1 to N on all cores and print a table", read=read_count)
+    parser.add_argument("--mode", choices=MODES, help=about)
+    about = "fly seeds 1 to N on all cores and print a table"
+    many.add_argument("--seeds", type=read_count, metavar="N", help=about)
     about = "start this program with the flight, and end it with it: a remote controller"
-    add("--with", "CMD", about, "", dest="beside")
+    parser.add_argument("--with", dest="beside", default="", metavar="CMD", help=about)
     report_arguments(parser)
     output_argument(parser, "json, yaml: print only the report")
     release_arguments(parser, DEFAULT_RELEASE)
@@ -83,13 +83,14 @@ def arguments(parser: Parser) -> None:
 
 def experiment_arguments(parser: Parser, seed: Arguments) -> None:
     """Declare the arguments that choose an experiment, with `--seed` in the group `seed`."""
-    add = flags(parser)
     about = "name of a shipped experiment, or a YAML file (default: paper)"
-    add("experiment", "EXPERIMENT", about, "paper", nargs="?")
+    parser.add_argument("experiment", nargs="?", default="paper", metavar="EXPERIMENT", help=about)
     about = "random seed of this run (default: the experiment's)"
-    flags(seed)("--seed", "S", about, read=read_seed)
-    add("--set", "KEY=VALUE", "change one key of the experiment; repeatable")
-    add("--out", "DIR", "folder of the run (default: a new one in runs/)")
+    seed.add_argument("--seed", type=read_seed, metavar="S", help=about)
+    set_argument(parser)
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder of the run (default: a new one in runs/)"
+    )
 
 
 def execute(options: Options) -> int:

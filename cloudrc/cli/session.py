@@ -19,7 +19,7 @@ from types import SimpleNamespace
 from typing import IO, Any
 
 from cloudrc.cli.output import print_line
-from cloudrc.cli.parser import Options, Parser, flags, whole_number
+from cloudrc.cli.parser import Options, Parser, whole_number
 from cloudrc.cli.report import report_arguments
 from cloudrc.cli.run import experiment_arguments, fly_once
 from cloudrc.cli.where import run_argument
@@ -58,10 +58,11 @@ does not end a flight of 'cloudrc run'; that flight ends with its mission."""
 
 def _up_arguments(parser: Parser) -> None:
     experiment_arguments(parser, parser)
-    add = flags(parser)
-    add("--console", "", "also open the console's page")
+    parser.add_argument("--console", action="store_true", help="also open the console's page")
     about = "serve the flight to Foxglove at this port of 127.0.0.1 (default: 8765)"
-    add("--foxglove", "PORT", about, read=whole_number(1, 65535), nargs="?", const=8765)
+    parser.add_argument(
+        "--foxglove", nargs="?", const=8765, type=whole_number(1, 65535), metavar="PORT", help=about
+    )
     report_arguments(parser)
     parser.set_defaults(output="table", beside="")
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 from argparse import ArgumentTypeError
+from pathlib import Path
 
 from cloudrc.cli.output import output_argument
 from cloudrc.cli.parser import (
@@ -15,7 +16,6 @@ from cloudrc.cli.parser import (
     Parser,
     add_verbs,
     figure_arguments,
-    flags,
     read_count,
     whole_number,
 )
@@ -45,57 +45,66 @@ docs/sweeps.md describes the file of a sweep and the shards of a cluster."""
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     run, attach, status, fly, figure, rows = add_verbs(parser, VERBS).values()
-    add = flags(run)
-    add("file", "FILE", "file of the sweep (.yaml)")
+    run.add_argument("file", type=Path, metavar="FILE", help="file of the sweep (.yaml)")
     about = "folder of the sweep (default: a new one in runs/); if it has rows, fly the others"
-    add("--out", "DIR", about)
+    run.add_argument("--out", type=Path, metavar="DIR", help=about)
     about = "number of parallel processes (default: one per usable core)"
-    add("--jobs", "N", about, COUNT_MAX, read_count)
+    run.add_argument("--jobs", type=read_count, default=COUNT_MAX, metavar="N", help=about)
     about = f"refuse a sweep with more flights (default: {FLIGHTS_MAX:,})"
-    add("--max-flights", "N", about, FLIGHTS_MAX, whole_number(1, 10**9))
+    run.add_argument(
+        "--max-flights", type=whole_number(1, 10**9), default=FLIGHTS_MAX, metavar="N", help=about
+    )
     about = "fly the failed or all flights again with a recording, into DIR/KEY"
-    add("--record", None, about, choices=("failed", "all"))
+    run.add_argument("--record", choices=("failed", "all"), help=about)
     about = "fly only part I of N, counted from 1"
-    add("--shard", "I/N", about, read=shard)
-    flags(rows)("file", "FILE", "file of flights, of a Job")
-    flags(rows)("--shard", "I/N", about, (1, 1), shard)
+    run.add_argument("--shard", type=shard, metavar="I/N", help=about)
+    rows.add_argument("file", type=Path, metavar="FILE", help="file of flights, of a Job")
+    rows.add_argument("--shard", type=shard, default=(1, 1), metavar="I/N", help=about)
     about = "folder, or s3://BUCKET/FOLDER, that keeps the rows; those in it are not flown again"
-    flags(rows)("--out", "PLACE", about)
+    rows.add_argument("--out", metavar="PLACE", help=about)
     _pod_arguments(run)
     for each in (attach, status, fly, figure):
-        flags(each)("folder", "DIR", "folder of a sweep")
-    flags(fly)("key", "KEY", "key of the row, or its first digits")
+        each.add_argument("folder", type=Path, metavar="DIR", help="folder of a sweep")
+    fly.add_argument("key", metavar="KEY", help="key of the row, or its first digits")
     for each in (run, attach, status):
         output_argument(each)
-    add = flags(figure)
     about = "metric to draw; repeatable (default: three that matter first)"
-    add("--number", "NAME", about, many=True)
-    add("--x", "AXIS", "axis of the sweep along x (default: the first one with numbers)")
+    figure.add_argument("--number", action="append", default=[], metavar="NAME", help=about)
+    about = "axis of the sweep along x (default: the first one with numbers)"
+    figure.add_argument("--x", metavar="AXIS", help=about)
     about = "axis with one line per value (default: the first with names, else the next one)"
-    add("--by", "AXIS", about)
-    add("--out", "FILE", "path of the files, with or without a suffix (default: DIR/figure)")
+    figure.add_argument("--by", metavar="AXIS", help=about)
+    about = "path of the files, with or without a suffix (default: DIR/figure)"
+    figure.add_argument("--out", type=Path, metavar="FILE", help=about)
     figure_arguments(figure, 3.5)
 
 
 def _pod_arguments(run: Parser) -> None:
     """Declare the flags of `--on kubernetes`."""
-    add = release_arguments(run)
-    about = "fly in the pods of a Job instead of on this machine"
-    add("--on", None, about, choices=("kubernetes",))
-    add("--shards", "N", "number of pods, at most one per flight (default: 8)", 8, read_count)
-    add("--parallelism", "N", "number of pods at once (default: all)", None, read_count)
-    add("--claim", "NAME", "PersistentVolumeClaim in which the pods keep their rows")
+    group = release_arguments(run)
+    group.add_argument(
+        "--on", choices=("kubernetes",), help="fly in the pods of a Job instead of on this machine"
+    )
+    about = "number of pods, at most one per flight (default: 8)"
+    group.add_argument("--shards", type=read_count, default=8, metavar="N", help=about)
+    group.add_argument(
+        "--parallelism", type=read_count, metavar="N", help="number of pods at once (default: all)"
+    )
+    group.add_argument(
+        "--claim", metavar="NAME", help="PersistentVolumeClaim in which the pods keep their rows"
+    )
     about = "bucket, or folder in it, in which the pods keep their rows"
-    add("--bucket", "s3://NAME", about, None, bucket)
+    group.add_argument("--bucket", type=bucket, metavar="s3://NAME", help=about)
     about = "image of the pods (default: cloudrc/world of this version, as the chart names it)"
-    add("--image", "IMAGE", about)
-    add("--cpu", "CPU", "CPU request of a pod, such as 500m or 2 (default: 1)", "1")
-    add("--cpu-limit", "CPU", "CPU limit of a pod (default: none)")
+    group.add_argument("--image", metavar="IMAGE", help=about)
+    about = "CPU request of a pod, such as 500m or 2 (default: 1)"
+    group.add_argument("--cpu", default="1", metavar="CPU", help=about)
+    group.add_argument("--cpu-limit", metavar="CPU", help="CPU limit of a pod (default: none)")
     about = "memory of a pod, such as 1Gi (default: requests 256Mi, takes at most 512Mi)"
-    add("--memory", "SIZE", about)
-    add("--queue", "NAME", "queue of Kueue that admits the Job")
+    group.add_argument("--memory", metavar="SIZE", help=about)
+    group.add_argument("--queue", metavar="NAME", help="queue of Kueue that admits the Job")
     about = "field of the Job, its pod or container, such as nodeSelector.disk=ssd; repeatable"
-    add("--set-job", "KEY=VALUE", about)
+    group.add_argument("--set-job", action="append", default=[], metavar="KEY=VALUE", help=about)
 
 
 def shard(text: str) -> tuple[int, int]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cloudrc.cli.parser import Options, Parser, flags, settings_from
+from cloudrc.cli.parser import Options, Parser, settings_from
 from cloudrc.cli.processes import process_arguments, read_address
 from cloudrc.drivers.process import StopSignal
 from cloudrc.drivers.realtime import Address
@@ -32,15 +32,23 @@ def arguments(parser: Parser) -> None:
         "serve the API here: [HOST:]PORT (default HOST: 127.0.0.1; PORT 0: any free port) or "
         "unix:PATH, for your user only"
     )
-    add = flags(parser)
-    add("--socket", "DIR", "folder of the two sockets", required=True)
-    add("--api", "WHERE", where, read=api_address, required=True)
-    add("--tokens", "DIR", "folder of the token files 'operator' and 'reader'")
-    add("--api-file", "FILE", "write the API's URL to this file")
-    add("--link", "FILE", "state of the link: its changes go to the mission's log")
-    add = flags(parser.add_mutually_exclusive_group())
-    add("--journal", "FILE", "store missions in this file (default: not stored)")
-    add("--start", "", "fly the experiment's mission, then exit")
+    parser.add_argument(
+        "--socket", type=Path, required=True, metavar="DIR", help="folder of the two sockets"
+    )
+    parser.add_argument("--api", type=api_address, required=True, metavar="WHERE", help=where)
+    about = "folder of the token files 'operator' and 'reader'"
+    parser.add_argument("--tokens", type=Path, metavar="DIR", help=about)
+    parser.add_argument(
+        "--api-file", type=Path, metavar="FILE", help="write the API's URL to this file"
+    )
+    about = "state of the link: its changes go to the mission's log"
+    parser.add_argument("--link", type=Path, metavar="FILE", help=about)
+    group = parser.add_mutually_exclusive_group()
+    about = "store missions in this file (default: not stored)"
+    group.add_argument("--journal", type=Path, metavar="FILE", help=about)
+    group.add_argument(
+        "--start", action="store_true", help="fly the experiment's mission, then exit"
+    )
 
 
 def api_address(text: str) -> Address | Path:

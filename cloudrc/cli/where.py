@@ -19,11 +19,9 @@ from typing import TYPE_CHECKING
 from cloudrc.cli.output import tell
 from cloudrc.cli.parser import (
     KUBECTL_PLUGIN,
-    Add,
     Arguments,
     Options,
     Parser,
-    flags,
     number,
     whole_number,
 )
@@ -42,32 +40,34 @@ READY_LIMIT = 300.0
 """Default time limit for the pods of a release to become ready [s]."""
 
 
-def release_arguments(parser: Parser, default: str = "the only one of the namespace") -> Add:
+def release_arguments(parser: Parser, default: str = "the only one of the namespace") -> Arguments:
     """Declare `--context` and `--namespace`, as in kubectl, and `--release` with a default.
 
-    Return a function that adds another flag to the same group of the help.
+    Return the group of the help, for other flags.
     """
-    add = cluster_arguments(parser, "(default: the context's, or default)")
-    add("--release", "NAME", f"Helm release (default: {default})")
-    add("--robot", "K", "number of a robot, if the release is a fleet", read=whole_number(0, 999))
-    return add
+    group = cluster_arguments(parser, "(default: the context's, or default)")
+    group.add_argument("--release", metavar="NAME", help=f"Helm release (default: {default})")
+    about = "number of a robot, if the release is a fleet"
+    group.add_argument("--robot", type=whole_number(0, 999), metavar="K", help=about)
+    return group
 
 
-def cluster_arguments(parser: Parser, namespace: str) -> Add:
+def cluster_arguments(parser: Parser, namespace: str) -> Arguments:
     """Declare `--context` and `--namespace`; the help of the latter ends with `namespace`.
 
-    Return a function that adds another flag to the same group of the help.
+    Return the group of the help, for other flags.
     """
-    add = flags(parser.add_argument_group("in a cluster (uses KUBECONFIG)"))
-    add("--context", "NAME", "kubeconfig context (default: current)")
-    add("-n --namespace", "NAME", f"namespace {namespace}")
-    return add
+    group: Arguments = parser.add_argument_group("in a cluster (uses KUBECONFIG)")
+    group.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
+    group.add_argument("-n", "--namespace", metavar="NAME", help=f"namespace {namespace}")
+    return group
 
 
 def timeout_argument(parser: Parser) -> None:
     """Declare `--timeout`, the time limit for a release to become ready."""
     about = f"seconds to wait until the release is ready (default: {READY_LIMIT:g})"
-    flags(parser)("--timeout", "S", about, READY_LIMIT, number(1e-3, 86_400, "seconds"))
+    seconds = number(1e-3, 86_400, "seconds")
+    parser.add_argument("--timeout", type=seconds, default=READY_LIMIT, metavar="S", help=about)
 
 
 def release_from_flags(options: Options) -> Release:
@@ -96,7 +96,9 @@ def flown_release(options: Options) -> Release:
 
 def run_argument(parser: Parser) -> None:
     """Declare the flag `--run`, which names a run on this machine."""
-    flags(parser)("--run", "DIR", "folder of a run that is flying on this machine")
+    parser.add_argument(
+        "--run", type=Path, metavar="DIR", help="folder of a run that is flying on this machine"
+    )
 
 
 def find_local_run(
@@ -138,10 +140,9 @@ def need_release(options: Options) -> Release:
 
 def api_arguments(parser: Arguments, text: str, *, required: bool = False) -> None:
     """Declare --api, the address of teleop's API, and --token-file."""
-    add = flags(parser)
-    add("--api", "URL", text, read=_api, required=required)
+    parser.add_argument("--api", type=_api, required=required, metavar="URL", help=text)
     about = f"file with the API's token (default: from {TOKEN_VARIABLE}, or the release's Secret)"
-    add("--token-file", "FILE", about)
+    parser.add_argument("--token-file", type=Path, metavar="FILE", help=about)
 
 
 def _api(text: str) -> str:
