@@ -122,7 +122,8 @@ class Parser(argparse.ArgumentParser):
         """Take the arguments of argparse; declare `--debug`, which every command and verb has."""
         self.declared: list[argparse.Action] = []
         self.verbs: Mapping[str, Parser] = {}
-        super().__init__(formatter_class=_formatter, allow_abbrev=False, **given)
+        form = partial(argparse.RawDescriptionHelpFormatter, max_help_position=26, width=80)
+        super().__init__(formatter_class=form, allow_abbrev=False, **given)
         about = "show the traceback of an error"
         self.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=about)
 
@@ -262,10 +263,14 @@ def build_parser(wanted: Container[str]) -> Parser:
     """
     # kubectl starts a plug-in by its file name, which nobody types.
     typed = "kubectl cloudrc" if Path(sys.argv[0]).name == KUBECTL_PLUGIN else "cloudrc"
+    groups = []
+    for title, lines in GROUPS.items():
+        named = [f"  {name:<12}{line}" for name, line in lines.items()]
+        groups.append("\n".join([f"{title}:", *named]))
     parser = Parser(
         prog=typed,
         usage=f"{typed} [-h] [--version] [--debug] COMMAND ...",
-        description="\n\n".join([ABOUT, *map(_lines, GROUPS)]),
+        description="\n\n".join([ABOUT, *groups]),
         epilog=EXAMPLES,
     )
     about = "print version and hash of the code"
@@ -310,12 +315,3 @@ def _find_command(name: str) -> Any:
     """
     module = importlib.import_module(f"cloudrc.cli.{MODULES.get(name, name)}")
     return getattr(module, name, module) if name in MODULES else module
-
-
-def _lines(title: str) -> str:
-    lines = [f"  {name:<12}{line}" for name, line in GROUPS[title].items()]
-    return "\n".join([f"{title}:", *lines])
-
-
-def _formatter(prog: str) -> argparse.HelpFormatter:
-    return argparse.RawDescriptionHelpFormatter(prog, max_help_position=26, width=80)
