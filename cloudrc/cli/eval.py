@@ -44,6 +44,29 @@ def arguments(parser: Parser) -> None:
     parser.add_argument("--env-arg", action="append", default=[], metavar="KEY=VALUE", help=about)
     about = "a Python file, or the address of a server (ws://...)"
     parser.add_argument("--policy", required=True, metavar="POLICY", help=about)
+    _execution_arguments(parser)
+    _episode_arguments(parser)
+    about = "size of an observation on the wire (default: that of its arrays)"
+    parser.add_argument("--observation-bytes", type=whole_number(0, 10**9), metavar="N", help=about)
+    about = "what of a message arrives (default: stream for a server, else datagrams)"
+    parser.add_argument("--delivery", choices=("datagrams", "stream"), help=about)
+    about = "most bytes of a packet; what is larger is several packets (default: 1200)"
+    parser.add_argument(
+        "--packet-bytes", type=whole_number(1, 10**9), default=1200, metavar="N", help=about
+    )
+    about = "parallel processes for a policy in a file (default: one per core)"
+    parser.add_argument("--jobs", type=read_count, default=COUNT_MAX, metavar="N", help=about)
+    about = "folder (default: a new one in runs/); if it has rows, play the others"
+    parser.add_argument("--out", type=Path, metavar="DIR", help=about)
+    about = "also write a line per episode into this file: .csv or .parquet"
+    parser.add_argument("--rows", type=Path, metavar="FILE", help=about)
+    about = "folder of another policy's evaluation, to compare with in pairs"
+    parser.add_argument("--versus", type=Path, metavar="DIR", help=about)
+    output_argument(parser, forms=TABLES)
+
+
+def _execution_arguments(parser: Parser) -> None:
+    """Declare what is between policy and environment, and what the policy observes of it."""
     about = "link profile, a name or a file (default: ideal)"
     parser.add_argument("--link", default="ideal", metavar="PROFILE", help=about)
     about = "mean round trips in ms, such as 0,40,80 (default: the profile's)"
@@ -70,6 +93,9 @@ def arguments(parser: Parser) -> None:
     )
     about = "the policy observes the step of its observation, too"
     parser.add_argument("--observe-step", action="store_true", help=about)
+
+
+def _episode_arguments(parser: Parser) -> None:
     about = "seeds 1 to N of each condition (default: 20)"
     parser.add_argument("--seeds", type=read_count, default=20, metavar="N", help=about)
     about = "file from the environment's observation to the policy's (YAML)"
@@ -84,23 +110,6 @@ def arguments(parser: Parser) -> None:
     parser.add_argument("--max-steps", type=read_count, default=10_000, metavar="N", help=about)
     about = "largest age of an observation behind an action, in s; older: late"
     parser.add_argument("--deadline", type=number(1e-6, 3600, "seconds"), metavar="S", help=about)
-    about = "size of an observation on the wire (default: that of its arrays)"
-    parser.add_argument("--observation-bytes", type=whole_number(0, 10**9), metavar="N", help=about)
-    about = "what of a message arrives (default: stream for a server, else datagrams)"
-    parser.add_argument("--delivery", choices=("datagrams", "stream"), help=about)
-    about = "most bytes of a packet; what is larger is several packets (default: 1200)"
-    parser.add_argument(
-        "--packet-bytes", type=whole_number(1, 10**9), default=1200, metavar="N", help=about
-    )
-    about = "parallel processes for a policy in a file (default: one per core)"
-    parser.add_argument("--jobs", type=read_count, default=COUNT_MAX, metavar="N", help=about)
-    about = "folder (default: a new one in runs/); if it has rows, play the others"
-    parser.add_argument("--out", type=Path, metavar="DIR", help=about)
-    about = "also write a line per episode into this file: .csv or .parquet"
-    parser.add_argument("--rows", type=Path, metavar="FILE", help=about)
-    about = "folder of another policy's evaluation, to compare with in pairs"
-    parser.add_argument("--versus", type=Path, metavar="DIR", help=about)
-    output_argument(parser, forms=TABLES)
 
 
 def _round_trips(text: str) -> tuple[float, ...]:
