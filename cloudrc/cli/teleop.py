@@ -43,12 +43,10 @@ def arguments(parser: Parser) -> None:
     )
     about = "state of the link: its changes go to the mission's log"
     parser.add_argument("--link", type=Path, metavar="FILE", help=about)
-    group = parser.add_mutually_exclusive_group()
     about = "store missions in this file (default: not stored)"
-    group.add_argument("--journal", type=Path, metavar="FILE", help=about)
-    group.add_argument(
-        "--start", action="store_true", help="fly the experiment's mission, then exit"
-    )
+    parser.add_argument("--journal", type=Path, metavar="FILE", help=about)
+    about = "fly the experiment's mission, or that of --journal, then exit"
+    parser.add_argument("--start", action="store_true", help=about)
 
 
 def api_address(text: str) -> Address | Path:

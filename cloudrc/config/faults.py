@@ -136,9 +136,10 @@ def refusal_in(mode: str, faults: Sequence[FaultConfig]) -> str:
     """Say why a mode ("virtual", "local" or "cluster") cannot inject these faults; "" if it can."""
     if mode == "cluster" and faults:
         return NOT_IN_CLUSTER
-    others = [fault.kind for fault in faults if fault.kind not in OF_LINK]
-    if mode == "local" and others:
-        return f"{others[0]} acts in virtual time only; use --mode virtual, or leave it out"
+    if mode == "local" and (clocks := acting(faults, *OF_CLOCK)):
+        return f"{clocks[0].kind} acts in virtual time only; use --mode virtual, or leave it out"
+    if mode == "local" and len(acting(faults, CLOUD_KILLED)) > 1:
+        return "in real time, cloud_killed is possible once; use --mode virtual, or leave one out"
     return ""
 
 

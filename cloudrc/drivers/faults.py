@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Inject faults of processes and clocks in virtual time."""
+"""Inject faults of processes and clocks: models of them in virtual time, signals in real time."""
 
 from __future__ import annotations
 
 from bisect import insort
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import itemgetter
-from typing import Any
+from signal import SIGCONT, SIGKILL, SIGSTOP, Signals
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.config.faults import (
     CLOUD_KILLED,
+    CLOUD_PAUSED,
     OF_CLOCK,
     TELEOP_KILLED,
+    WORLD_PAUSED,
     FaultConfig,
     acting,
 )
@@ -26,6 +29,9 @@ from cloudrc.records import MissionEvent, Record
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import MissionRecord
 from cloudrc.teleop.wire import Output, RobotStatus
+
+if TYPE_CHECKING:
+    from cloudrc.drivers.local import Child
 
 FAR_NS = 1 << 62
 SOCKET_MAX = 256
@@ -233,6 +239,52 @@ def disturbed(
         else:
             process.at(begin, process.freeze, over - begin)
     return process
+
+
+SIGNALS = {
+    CLOUD_KILLED: ("cloud", SIGKILL),
+    CLOUD_PAUSED: ("cloud", SIGSTOP),
+    TELEOP_KILLED: ("teleop", SIGKILL),
+    WORLD_PAUSED: ("world", SIGSTOP),
+}
+"""Kind of fault -> process, and the signal that it gets at the begin."""
+
+
+class SignalledFaults:
+    """Sends the signals of faults to the processes of a local run, and starts killed ones again.
+
+    Attributes:
+        away: Processes that are killed or stand still.
+        kills_teleop: Whether teleop has to store its mission.
+    """
+
+    def __init__(self, faults: Sequence[FaultConfig]) -> None:
+        """Send nothing before `begin`."""
+        self.away = set[str]()
+        self.kills_teleop = bool(acting(faults, TELEOP_KILLED))
+        self._planned = list[tuple[float, str, Signals]]()
+        for fault in acting(faults, *SIGNALS):
+            name, number = SIGNALS[fault.kind]
+            self._planned += [(fault.at_s, name, number), (fault.end, name, SIGCONT)]
+        self._planned.sort()
+
+    def begin(self, now: float, again: Mapping[str, Callable[[], None]]) -> None:
+        """Begin at `now` [s], monotonic clock; `again` starts the process of a name."""
+        self._origin, self._again = now, again
+
+    def act(self, now: float, children: list[Child]) -> None:
+        """Do what is due at `now` [s], monotonic clock, with the running `children`."""
+        while self._planned and self._planned[0][0] <= now - self._origin:
+            _, name, number = self._planned.pop(0)
+            running = [each for each in children if each.name == name]
+            self.away ^= {name}
+            for child in running:
+                child.process.send_signal(number)
+                if number == SIGKILL:
+                    child.process.wait()
+                    children.remove(child)
+            if not running:
+                self._again[name]()
 
 
 def _ns(seconds: float) -> int:

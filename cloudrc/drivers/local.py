@@ -27,17 +27,16 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, NamedTuple
 
+from cloudrc.config.faults import FaultConfig
+from cloudrc.drivers.faults import SignalledFaults
 from cloudrc.drivers.machine import AwakeClock, await_or_kill, interpreter
 from cloudrc.drivers.process import PARENT, READY, from_line
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.errors import (
-    ControllerLostError,
-    InvalidRunError,
-    TimedOutError,
-)
+from cloudrc.errors import ControllerLostError, InvalidRunError, TimedOutError
 from cloudrc.files import make_own_folder, try_lock, who_may_write
 from cloudrc.link.follow import PROFILE
 from cloudrc.link.state import STATE_FILE
@@ -235,6 +234,7 @@ class LocalRun:
         remote: bool = False,
         lost: Callable[[list[Record]], None] = lambda records: None,
         gone: Callable[[], bool] = lambda: False,
+        faults: Sequence[FaultConfig] = (),
     ) -> None:
         """Prepare a run in `folder`; start no process yet.
 
@@ -248,11 +248,11 @@ class LocalRun:
 
         With `remote`, a sixth process asks a controller outside. `lost` gets the same records as
         `see`, and raises a ControllerLostError if this controller is lost. `gone` returns whether
-        the user's program beside the flight has ended.
+        the user's program beside the flight has ended. `faults` are those to inject.
         """
         self._remote, self._lost, self._gone = remote, lost, gone
         self._folder, self._see, self._session = folder, see, session
-        self._metrics: dict[str, str] = {}
+        self._metrics, self._faults = dict[str, str](), SignalledFaults(faults)
         self.announcement = contextlib.ExitStack()
         self._children: list[Child] = []
         self._selector = selectors.DefaultSelector()
@@ -289,8 +289,11 @@ class LocalRun:
         if self._remote:
             self._start(robot.folder, CONTROLLER, "policy", "drive", socket=robot.sockets)
             self._wait_until_ready()
-        self._start_end(robot, "cloud", ROUTE_FILE, teleop=robot.sockets)
+        cloud = partial(self._start_end, robot, "cloud", ROUTE_FILE, teleop=robot.sockets)
+        cloud()
         self._wait_until_ready()
+        again = {"cloud": cloud, "teleop": partial(self._start_teleop, robot)}
+        self._faults.begin(time.monotonic(), again)
         if session:
             session(robot.url, self._metrics)
         self._watch(limit, robot.sockets)
@@ -329,12 +332,15 @@ class LocalRun:
 
     def _start_teleop(self, robot: RobotProcesses) -> None:
         folder = robot.folder
+        words = [f"--journal={folder / JOURNAL_FILE}"] if self._session else ["--start"]
+        if self._faults.kills_teleop and not self._session:
+            words += [f"--journal={robot.sockets / JOURNAL_FILE}"]
         # Only this user can open the socket of the API: no token is needed.
         self._start(
             folder,
             "teleop",
             "teleop",
-            *([f"--journal={folder / JOURNAL_FILE}"] if self._session else ["--start"]),
+            *words,
             f"--api-file={folder / API_FILE}",
             socket=robot.sockets,
             api=robot.url,
@@ -358,15 +364,14 @@ class LocalRun:
 
     def _start(self, folder: Path, name: str, *words: str, **options: object) -> None:
         options["config"] = folder / "config.yaml"
-        if name in self._metrics:
-            options["metrics"] = self._metrics[name]
+        options |= {"metrics": self._metrics[name]} if name in self._metrics else {}
         log = folder / f"{name}.log"
-        with log.open("wb") as errors:
+        with log.open("ab") as errors:
             process = start_process([*words, "--feed"], options, subprocess.PIPE, errors)
         assert process.stdout is not None
         os.set_blocking(process.stdout.fileno(), False)
         label = str((folder / name).relative_to(self._folder))
-        self._children.append(Child(label, process, log))
+        self._children.append(Child(label, process, log, heard=self._clock()))
         self._selector.register(process.stdout, selectors.EVENT_READ, self._children[-1])
 
     def _wait_until_ready(self) -> None:
@@ -379,8 +384,10 @@ class LocalRun:
 
     def _watch(self, limit: float, sockets: Path) -> None:
         until, paused = self._clock() + limit, self._clock.pause
-        teleops = [child for child in self._children if child.is_teleop]
-        while any(teleop.process.poll() is None for teleop in teleops):
+        while "teleop" in self._faults.away or any(
+            child.is_teleop and child.process.poll() is None for child in self._children
+        ):
+            self._faults.act(time.monotonic(), self._children)
             records = self._listen()
             self._see(records)
             self._lost(records)
@@ -398,6 +405,8 @@ class LocalRun:
                 paused = self._clock.pause
             self._check_alive()
             for child in self._children:
+                if child.name in self._faults.away or not child.ready:
+                    child.heard = now
                 if now - child.heard > SILENCE_LIMIT and child.process.poll() is None:
                     raise TimedOutError(
                         f"the {child.name} process was silent for {SILENCE_LIMIT:g} s and was "
@@ -435,6 +444,7 @@ class LocalRun:
     def _stop(self) -> None:
         for child in self._children:
             child.process.terminate()
+            child.process.send_signal(signal.SIGCONT)  # a fault may have stopped it
         deadline = time.monotonic() + STOP_LIMIT
         for child in self._children:
             await_or_kill(child.process, max(0.0, deadline - time.monotonic()))

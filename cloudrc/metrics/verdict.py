@@ -42,7 +42,7 @@ from cloudrc.metrics.mission import (
 from cloudrc.metrics.response import responses
 from cloudrc.record import STOPPED
 from cloudrc.record.columns import Recording
-from cloudrc.record.holes import describe
+from cloudrc.record.holes import describe, unasked
 from cloudrc.records import (
     CONTROLLER_LOST,
     REAL_TIME_FACTOR_MIN,
@@ -255,15 +255,18 @@ def flight_evidence(
     real_time: bool,
     interrupted: bool,
     kills: int = 0,
+    paused: float = 0.0,
 ) -> Evidence:
     """Collect the evidence for the verdict from the records and from the metrics of a flight.
 
     `real_time` is True if the run had to keep real time: in all modes except virtual. `interrupted`
     is True if the run was stopped.
 
-    The sessions after the `kills` of cloud that the experiment has asked for are no failures.
+    What the experiment has asked for is no failure by itself: the sessions and the lost records
+    after `kills` of cloud, and the time for which world was `paused` [s].
     """
     recording, end_ns = flight.recording, flight.end_ns
+    holes = unasked(recording.holes, kills)
     reached, touch = numbers.get("waypoints_reached"), None
     if row := flight.first_touch:
         speed = float(np.linalg.norm(row["touch_velocity"]))
@@ -277,8 +280,8 @@ def flight_evidence(
         time_limit=flight.criteria.time_limit_s or inf,
         touch=touch,
         violations=tuple(_violations(flight, kills)),
-        slow=_not_real_time(numbers) if real_time else "",
-        lost=describe(recording.holes, flight.seconds) or recording.note,
+        slow=_not_real_time(numbers, paused) if real_time else "",
+        lost=describe(holes, flight.seconds) or ("" if recording.holes else recording.note),
         unconfirmed=unconfirmed(flight),
     )
 
@@ -415,14 +418,15 @@ def _missed_end(flight: Flight, settle: float) -> Iterator[FlightFailure]:
     yield FlightFailure("not_settled", text, *_moment(flight, ending[0]))
 
 
-def _not_real_time(numbers: Mapping[str, Number]) -> str:
+def _not_real_time(numbers: Mapping[str, Number], paused: float) -> str:
     factor, slip = numbers.get("real_time_factor"), numbers.get("world_slip")
     if factor is None or slip is None:
         return "the recording does not prove that the run kept real time"
-    if slow := _too_slow(factor.value):
+    if not paused and (slow := _too_slow(factor.value)):
         return slow
-    if exceeds(slip.value, SLIP_MAX):
-        return f"world's clock lost {slip.value:.4g} s, more than {SLIP_MAX} s: {ADVICE}"
+    lost = slip.value - paused
+    if exceeds(lost, SLIP_MAX):
+        return f"world's clock lost {lost:.4g} s, more than {SLIP_MAX} s: {ADVICE}"
     return ""
 
 

@@ -83,7 +83,7 @@ def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
         units = {name: each.unit for name, each in sensors.items()}
         place = steered_in(world), scene_of(world), hull_of(world.robot)
         service = MissionService(book, *place, units, speed_max=limit)
-        if settings.start:
+        if settings.start and not book.missions:  # else an earlier process has begun it
             order = Order(assembly.build_plan(experiment), experiment.name, touch=touch)
             service.create(order, time.monotonic_ns())
         pause = GracefulStop(

@@ -55,6 +55,13 @@ def goes_on(holes: Iterable[Hole]) -> bool:
     return any(hole.end_ns < END_NS or hole == SOMEWHERE for hole in holes)
 
 
+def unasked(holes: Iterable[Hole], kills: int) -> list[Hole]:
+    """Return the holes but for the first `kills` ones before a message: faults made them."""
+    ordered = sorted(set(holes))
+    made = [hole for hole in ordered if hole.end_ns < END_NS][:kills]
+    return [hole for hole in ordered if hole not in made]
+
+
 def union(holes: Iterable[Hole]) -> tuple[Hole, ...]:
     """Return holes of the same times, in their order and without an overlap."""
     apart = list[Hole]()

@@ -33,6 +33,7 @@ from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, union
 from cloudrc.record.topics import TOPICS
 from cloudrc.records import UNDER_WAY
 
+KILLED = "a fault killed the process, whose last records are lost"
 BEFORE_NS, AFTER_NS = 1_000_000_000, 2_000_000_000
 """A cut recording begins BEFORE_NS before the mission's start and ends AFTER_NS after its end [ns].
 It thus includes the start of the session and the guard's first change of state."""
@@ -122,11 +123,13 @@ def _lag_ns(
     return lag_ns
 
 
-def merge(world: Path, cloud: Path, last_ns: int | None = None) -> Recording:
+def merge(
+    world: Path, cloud: Path, last_ns: int | None = None, *, killed: bool = False
+) -> Recording:
     """Merge the files of world and cloud, complete or torn, into one mission on world's clock.
 
     With `last_ns`, read the messages of the last time [ns] at least. What was recorded before a
-    file was begun is read, too.
+    file was begun is read, too, if it is complete, or if the process was `killed` on purpose.
 
     If one file cannot be read, the result contains only the other file, on that file's own clock,
     and a note. It is an error if neither file can be read.
@@ -135,7 +138,7 @@ def merge(world: Path, cloud: Path, last_ns: int | None = None) -> Recording:
     failures = []
     for end, path in (("world", world), ("cloud", cloud)):
         try:
-            found[end] = _read(path, last_ns)
+            found[end] = _read(path, last_ns, killed=killed)
         except CloudrcError as error:
             failures.append(error)
     if not found:
@@ -152,8 +155,11 @@ def merge(world: Path, cloud: Path, last_ns: int | None = None) -> Recording:
     return mission
 
 
-def _read(path: Path, last_ns: int | None) -> Recording:
-    """Read a recording, and the complete part before it, if both have stamps of one clock."""
+def _read(path: Path, last_ns: int | None, *, killed: bool) -> Recording:
+    """Read a recording, and the part before it, if both have stamps of one clock.
+
+    The part must be complete, unless its process was `killed`: then its lost end becomes a hole.
+    """
     recording, earlier = Recording.read(path, last_ns=last_ns), part_before(path)
     newer = recording.messages
     is_enough = bool(newer) and newer[0][1] < newer[-1][1] - (last_ns or END_NS)
@@ -167,10 +173,13 @@ def _read(path: Path, last_ns: int | None) -> Recording:
     older = before.messages
     follows = bool(older) and (not newer or older[0][1] < newer[0][1])
     same_clock = before.metadata.get("clock_id") == recording.metadata.get("clock_id")
-    if follows and same_clock and not before.lacking:
+    if follows and same_clock and (killed or not before.lacking):
         recording.messages = sorted([*older, *newer], key=itemgetter(1))
-        recording.holes = union([*before.holes, *recording.holes])
-        recording.told = "; ".join(filter(None, [before.told, recording.told]))
+        goes_on_ns = newer[0][1] if newer and before.lacking else END_NS
+        holes = [hole._replace(end_ns=min(hole.end_ns, goes_on_ns)) for hole in before.holes]
+        recording.holes = union([*holes, *recording.holes])
+        lost = KILLED if before.lacking else ""
+        recording.told = "; ".join(filter(None, [before.told, lost, recording.told]))
     return recording
 
 

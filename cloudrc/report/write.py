@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cloudrc.config.faults import CLOUD_KILLED, acting
+from cloudrc.config.faults import CLOUD_KILLED, WORLD_PAUSED, acting
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.config.time_line import link_start
@@ -56,6 +56,7 @@ def assess(
         real_time=run.mode != "virtual",
         interrupted=run.interrupted,
         kills=len(acting(experiment.faults, CLOUD_KILLED)),
+        paused=sum(each.length for each in acting(experiment.faults, WORLD_PAUSED)),
     )
     verdict, operator = judge(evidence), None
     notes = list(run.notes)

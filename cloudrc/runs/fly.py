@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Literal, Self, TypeAlias
 
 from cloudrc import assembly, source
+from cloudrc.config.faults import CLOUD_KILLED, acting
 from cloudrc.config.overrides import OUTSIDE, REMOTE
 from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.drivers.companion import companion
@@ -233,7 +234,10 @@ def _fly_local(
     """
     make_folder(folder / LINK_FOLDER, experiment.link_values)
     remote = experiment.cloud.controller.name in OUTSIDE
-    local = LocalRun(folder, see, session, remote=remote, lost=_raise_if_lost, gone=gone)
+    faults = experiment.faults
+    local = LocalRun(
+        folder, see, session, remote=remote, lost=_raise_if_lost, gone=gone, faults=faults
+    )
     limit = inf if session else assembly.flight_limit(experiment)
     broken, interrupted = end_of(lambda: local.fly(limit))
     landed()
@@ -241,7 +245,8 @@ def _fly_local(
         if session:
             mission, experiment, interrupted = read_last_mission(folder)
         else:
-            mission = merge(folder / "world.mcap", folder / "cloud.mcap")
+            killed = bool(acting(experiment.faults, CLOUD_KILLED))
+            mission = merge(folder / "world.mcap", folder / "cloud.mcap", killed=killed)
     try:
         document = write_merged(
             folder, mission, experiment, report, local.notes, interrupted=interrupted, broken=broken

@@ -75,11 +75,18 @@ def test_what_is_impossible_is_refused_in_one_line(fault, setting, said):
     assert said in refused_line("steps", setting, *round_, f"faults=[{{{fault}}}]")
 
 
-@pytest.mark.parametrize("fault", [KILLED, "kind: clock_step, at_s: 1, step_s: 1"])
-def test_what_real_time_cannot_inject_is_refused_with_the_key(fault):
-    check_mode(faulty(fault), "virtual")
-    with pytest.raises(BadInputError, match=r"faults: c.* acts in virtual time only"):
-        check_mode(faulty(fault), "local")
+@pytest.mark.parametrize(
+    ("faults", "said"),
+    [
+        (["kind: clock_step, at_s: 1, step_s: 1"], "faults: clock_step acts in virtual time only"),
+        ([KILLED, KILLED.replace("4", "9")], "faults: .*cloud_killed is possible once"),
+    ],
+)
+def test_what_real_time_cannot_inject_is_refused_with_the_key(faults, said):
+    found = faulty(*faults)
+    check_mode(found, "virtual")
+    with pytest.raises(BadInputError, match=said):
+        check_mode(found, "local")
 
 
 def test_a_cluster_names_the_command_that_injects(tmp_path):

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from cloudrc.drivers import local
+from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 from tests.conftest import nightly, nightly_rows, wait_until
 from tests.drivers.conftest import COMMAND, start, wait_until_flying
@@ -131,3 +132,26 @@ def check_delays(recording):
     parts = [delays[(sent_ns > a + 1e8) & (sent_ns < b)] for a, b in pairwise(edges)]
     asked = [0.045, 0.120, 0.025]
     assert list(map(np.median, parts)) == pytest.approx(asked, abs=0.005), "beside other tests"
+
+
+FAULTS = """faults=[
+{kind: cloud_killed, at_s: 4, duration_s: 0.5},
+{kind: teleop_killed, at_s: 9, duration_s: 0.5},
+{kind: world_paused, at_s: 12, duration_s: 0.6},
+{kind: cloud_paused, at_s: 14, duration_s: 0.6}]"""
+
+
+@pytest.mark.alone
+def test_faults_are_real_signals_and_the_mission_goes_on(tmp_path):
+    run = start(tmp_path / "run", FAULTS, dwell=18.0)
+    output, errors = run.communicate(timeout=90)
+    assert run.returncode == 0, output + errors
+    recording = Recording.read(tmp_path / "run" / "mission.mcap")
+    assert recording["/mission"]["event"].tolist() == ["started", "resumed", "reached", "done"]
+    assert (recording["/session"]["end"] == "world").sum() == 3, "of cloud, mission, new cloud"
+    sent, guard = recording["/telemetry"], recording["/guard"]
+    held = (guard["stamp_ns"][guard["state"] == GuardState.HOLD] - sent["stamp_ns"][0]) * 1e-9
+    assert held[0] == pytest.approx(4.25, abs=0.3)
+    assert sent["slip_ns"][-1] * 1e-9 == pytest.approx(0.6, abs=0.15)
+    (hole,) = recording.holes
+    assert (hole.end_ns - hole.begin_ns) * 1e-9 < 5.0, "the new cloud records"

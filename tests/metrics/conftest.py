@@ -61,10 +61,10 @@ def measured(flight, name):
     return SHIPPED[name].measure(flight)
 
 
-def judged(flight, numbers=None, *, real_time=False, interrupted=False):
+def judged(flight, numbers=None, *, real_time=False, interrupted=False, **asked):
     """Return the verdict on a flight, by default with the numbers that it has."""
     numbers = measure_all(flight).numbers if numbers is None else numbers
-    known = flight_evidence(flight, numbers, real_time=real_time, interrupted=interrupted)
+    known = flight_evidence(flight, numbers, real_time=real_time, interrupted=interrupted, **asked)
     return judge(known)
 
 

@@ -42,6 +42,12 @@ def test_an_incomplete_recording_proves_neither_success_nor_a_missed_goal(spans,
     assert ("as far as the recording goes" in failure.text) == known
 
 
+@pytest.mark.parametrize(("kills", "outcome"), [(1, "invalid"), (2, "success")])
+def test_what_a_fault_has_lost_is_no_failure(kills, outcome):
+    flight = lossy(flown(), (4.0, 4.5), (6.0, 6.5))
+    assert judged(flight, kills=kills).outcome == outcome
+
+
 def test_numbers_in_spite_of_a_hole_are_those_of_the_whole_flight():
     whole = measure_all(flown().flight())[0]
     found, notes, _ = measure_all(lossy(flown(), (5.0, 5.5)))

@@ -121,6 +121,18 @@ def test_a_complete_part_before_on_the_same_clock_belongs_to_a_recording(
     assert len(merge(world, cloud)["/odometry"]) == 50
 
 
+def test_of_a_process_that_a_fault_killed_the_last_records_are_a_hole(tmp_path):
+    ends = files(tmp_path, world_records(50, SECOND), cloud_records(50, SECOND), ("a", "a"))
+    part = write(part_before(ends[0]), world_records(30), "world", "a")
+    part.write_bytes(part.read_bytes()[: part.stat().st_size * 2 // 5])
+    assert len(merge(*ends)["/odometry"]) == 50
+    mission = merge(*ends, killed=True)
+    assert len(mission["/odometry"]) == 80
+    mission.write(tmp_path / "mission.mcap", {})
+    (hole,) = Recording.read(tmp_path / "mission.mcap").holes
+    assert hole.begin_ns < SECOND <= hole.end_ns < 2 * SECOND
+
+
 def test_a_part_that_has_just_begun_hides_nothing_of_the_part_before(tmp_path):
     world, cloud = files(tmp_path, [], cloud_records(50, SECOND), ("a", "a"))
     write(part_before(world), world_records(50, SECOND), "world", "a")
