@@ -57,7 +57,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo live live-flight test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly viser lint spdx types api audit bench bench-cell results shown pictures docs site dist owner images kind-load lock clean
+.PHONY: help demo live live-flight test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly viser lint spdx types api audit bench bench-cell results shown pictures hashes docs site dist owner images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -290,6 +290,9 @@ pictures: $(VENV)/dev ## draw the README's film and the pictures of robots and m
 	@$(bin)/python -c "import tools.pictures.stage" || { \
 		echo "make pictures needs EGL: apt-get install libegl1 libgl1-mesa-dri" >&2; exit 3; }
 	$(bin)/python -m tools.pictures
+
+hashes: $(VENV)/dev ## fly the commands of tests/flights/hashes.json, and write their hashes: minutes
+	$(bin)/python -m tests.flights.hashes
 
 docs: $(VENV)/dev ## write the generated tables of docs/, and the chart's schema, table and copied files
 	$(bin)/python -m tools.docs
