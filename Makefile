@@ -247,7 +247,7 @@ lint: $(VENV)/dev ## check format and rules
 
 # Sources that name their licence, beside SCRIPTS. REUSE.toml speaks for all other files, and for those of one byte.
 LICENSED = git ls-files -z -- '*.py' '*.c' '*.js' '*.css' Makefile 'images/*/Dockerfile' '.github/**.y*ml' \
-	':!tests/fixtures' ':!tests/exercise/solution' ':!tools/net/own' | xargs -0 sh -c 'find "$$@" -size +1c -print0' find
+	':!tests/fixtures' ':!tests/exercise/solution' | xargs -0 sh -c 'find "$$@" -size +1c -print0' find
 spdx: $(VENV)/dev ## write the line of the licence into new sources (with the tool of REUSE)
 	$(bin)/python -m pip install --quiet 'reuse>=6'
 	$(LICENSED) | xargs -0 $(bin)/reuse annotate --license Apache-2.0 --skip-existing
