@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Put the machine code of the Pelican's steps and predictions into a wheel, if CLOUDRC_NATIVE is 1.
+"""Put the machine code of steps and predictions into a wheel, if CLOUDRC_NATIVE is 1.
 
 Otherwise the wheel is pure Python, and a machine with a compiler makes the code when it flies.
 """
@@ -28,7 +28,7 @@ class NativeStep(BuildHookInterface):  # type: ignore[type-arg]
         if os.environ.get("CLOUDRC_NATIVE") != "1" or version == "editable":
             return
         sys.path.insert(0, str(ROOT))
-        from cloudrc.robots.pelican.native.library import ADVICE, built_file, compile_to, compilers
+        from cloudrc.robots.native.library import ADVICE, built_file, compile_to, compilers
 
         command = next((command for _, command in compilers()), None)
         if command is None:

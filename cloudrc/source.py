@@ -14,7 +14,7 @@ from hashlib import sha256
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 
-SUFFIXES = (".py", ".c", ".xml", ".yaml")
+SUFFIXES = (".py", ".c", ".h", ".xml", ".yaml")
 """Endings of source files. Files that are built from them, such as *.pyc and *.so, do not count."""
 NOT_FLOWN = frozenset(
     {"_chart", "cli", "cluster", "console", "exercise", "exposition", "studies", "trials"}

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 import cloudrc
-from cloudrc.robots.pelican.native.library import built_file, compilers
+from cloudrc.robots.native.library import built_file, compilers
 from tests.support.commands import python
 from tools.pack_chart import pack
 from tools.set_registry import set_registry
@@ -93,7 +93,7 @@ def test_a_platform_wheel_holds_the_machine_code(tmp_path, monkeypatch):
     build(ROOT, tmp_path, "wheel")
     name, packed = wheel_in(tmp_path)
     assert "-py3-none-any" not in name
-    assert f"cloudrc/robots/pelican/native/{built_file().name}" in packed
+    assert f"cloudrc/robots/native/{built_file().name}" in packed
     assert not built_file().exists()
 
 

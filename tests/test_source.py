@@ -36,7 +36,7 @@ def test_built_files_and_those_of_an_editor_do_not_count(copy, hash_of):
     assert hash_of(copy) == source.code_hash()
     (copy / "__pycache__").mkdir()
     (copy / "__pycache__/source.cpython-313.pyc").write_bytes(b"built")
-    (copy / "robots/pelican/native/step-1-cc.so").write_bytes(b"built")
+    (copy / "robots/native/step-1-cc.so").write_bytes(b"built")
     (copy / ".#assembly.py").symlink_to("somebody@host.1")
     (copy / "_chart").mkdir()
     (copy / "_chart/values.yaml").write_text("a: wheel has the chart\n")
@@ -46,8 +46,9 @@ def test_built_files_and_those_of_an_editor_do_not_count(copy, hash_of):
 
 def test_each_kind_of_source_counts(copy, hash_of):
     seen = {source.code_hash()}
-    for name in ("rotors.py", "native/step.c", "robot.xml", "robot.yaml"):
-        with (copy / "robots/pelican" / name).open("a") as file:
+    names = "pelican/rotors.py", "native/step.c", "native/step.h", "x2/robot.xml", "x2/robot.yaml"
+    for name in names:
+        with (copy / "robots" / name).open("a") as file:
             file.write("\n")
         assert hash_of(copy) not in seen
         seen.add(hash_of(copy))

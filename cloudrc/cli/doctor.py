@@ -43,7 +43,7 @@ from cloudrc.sim.engine import at_rest, mujoco
 m = mujoco.MjModel.from_xml_string('<mujoco/>')
 mujoco.mj_step(m, at_rest(m))
 print('{WORKS}', flush=True)
-from cloudrc.robots.pelican.native.library import library
+from cloudrc.robots.native.library import library
 print(library().text)
 """
 """Runs in a process of its own, because a broken library may abort the process."""

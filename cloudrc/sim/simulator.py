@@ -68,6 +68,7 @@ class Simulator:
         steps: Number of steps since the last reset.
         contacts: Number of contacts in the last step.
         sensors: The robot's own sensors, those of its `robot.yaml`.
+        force_address: Where MuJoCo writes the force on the probe; None: no sensor measures it.
         force_sensor: Label of the one of `sensors` that shows the force on the probe, if any.
         force_peak: Largest force on the probe since the last call of `take_contact_force` [N].
         impulse: Integral over time of the force on the probe since that call [N s].
@@ -115,8 +116,8 @@ class Simulator:
         addresses = [each.address for each in sensors]
         self._read_sensors = sensor_reader(self._sensordata, addresses)
         self._probe = -1 if probe is None else find_part(model, "site", probe, "probe")
-        self._force_address = _find_force(model, self._probe)
-        of_force = (each for each in sensors if each.address == self._force_address)
+        self.force_address = _find_force(model, self._probe)
+        of_force = (each for each in sensors if each.address == self.force_address)
         self.force_sensor = next((SensorLabel(each.name, each.unit) for each in of_force), None)
         self._probe_offset: Vector = ZERO
         self._probe_radius = -1.0
@@ -224,9 +225,9 @@ class Simulator:
         The force [N] is that at the beginning of the last step. Peak [N] and impulse [N s] are
         those since the last call of this method, which resets both.
         """
-        if self._force_address is None:
+        if self.force_address is None:
             return None
-        found = self._sensordata[self._force_address], self.force_peak, self.impulse
+        found = self._sensordata[self.force_address], self.force_peak, self.impulse
         self.force_peak = self.impulse = 0.0
         return found
 
@@ -254,8 +255,8 @@ class Simulator:
 
         `contacts` is the number of contacts in the step; `before` has the readings before the step.
         """
-        if self._force_address is not None:
-            force = self._sensordata[self._force_address]
+        if self.force_address is not None:
+            force = self._sensordata[self.force_address]
             self.impulse += force * self.dt
             if force > self.force_peak:
                 self.force_peak = force

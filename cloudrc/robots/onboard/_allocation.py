@@ -28,6 +28,8 @@ class Allocation:
         acceleration_max: Largest acceleration along z without torque [m/s^2].
         turn_max: Largest angular acceleration about x and about y in hover, in both directions
             [rad/s^2].
+        columns: Controls per acceleration along z and per angular acceleration about x, y and z.
+        limits: Smallest and largest value of each control.
         yaw_max: Largest angular acceleration about z in hover, in both directions [rad/s^2].
     """
 
@@ -52,8 +54,8 @@ class Allocation:
         self.turn_max, self.yaw_max = float(reach[:2].min()), float(reach[2])
         least = np.clip(0.0, frame.low, frame.high)
         self.stopped: Commands = tuple(least.tolist())
-        self._columns = list(zip(thrust.tolist(), *turns.T.tolist(), strict=True))
-        self._limits = list(zip(frame.low.tolist(), frame.high.tolist(), strict=True))
+        self.columns = list(zip(thrust.tolist(), *turns.T.tolist(), strict=True))
+        self.limits = list(zip(frame.low.tolist(), frame.high.tolist(), strict=True))
         self._lifts = abs(thrust) > TINY * abs(thrust).max()
         self._gravity = frame.gravity
 
@@ -68,10 +70,10 @@ class Allocation:
         commands = tuple(
             [
                 lift * thrust + turn_x * roll + turn_y * pitch + turn_z * yaw
-                for lift, turn_x, turn_y, turn_z in self._columns
+                for lift, turn_x, turn_y, turn_z in self.columns
             ]
         )
-        for command, (low, high) in zip(commands, self._limits, strict=True):
+        for command, (low, high) in zip(commands, self.limits, strict=True):
             if not low <= command <= high:
                 return self._saturate(thrust, roll, pitch, yaw)
         return commands
@@ -82,11 +84,11 @@ class Allocation:
         A control that lifts is `lift` · (thrust + turn); so each range limits the thrust to an
         interval, and a shorter turn makes the intervals overlap.
         """
-        turns = [turn_x * roll + turn_y * pitch for _, turn_x, turn_y, _ in self._columns]
+        turns = [turn_x * roll + turn_y * pitch for _, turn_x, turn_y, _ in self.columns]
         thrusts = min(thrust, self._gravity), max(thrust, self._gravity)
         shorter, intervals = 1.0, [(*thrusts, 0.0)]
         for (lift, *_), turn, limits, lifts in zip(
-            self._columns, turns, self._limits, self._lifts, strict=True
+            self.columns, turns, self.limits, self._lifts, strict=True
         ):
             if lifts:
                 low, high = sorted(limit / lift for limit in limits)
@@ -102,14 +104,14 @@ class Allocation:
         thrust = min(max(thrust, least), most)
         before = [
             column[0] * thrust + shorter * turn
-            for column, turn in zip(self._columns, turns, strict=True)
+            for column, turn in zip(self.columns, turns, strict=True)
         ]
         return self._add_yaw(before, yaw)
 
     def _add_yaw(self, before: list[float], yaw: float) -> Commands:
         """Add as much of the turn about z to the controls as their ranges allow."""
         part = 1.0
-        for value, column, (low, high) in zip(before, self._columns, self._limits, strict=True):
+        for value, column, (low, high) in zip(before, self.columns, self.limits, strict=True):
             change = column[3] * yaw
             if change > 0.0:
                 part = min(part, max(high - value, 0.0) / change)
@@ -120,7 +122,7 @@ class Allocation:
             [
                 min(max(value + part * yaw * column[3], low), high)
                 for value, column, (low, high) in zip(
-                    before, self._columns, self._limits, strict=True
+                    before, self.columns, self.limits, strict=True
                 )
             ]
         )

@@ -14,7 +14,13 @@ from cloudrc.sim.readings import Readings
 
 
 class RotorDrag(Direct):
-    """Actuators that MuJoCo simulates, with rotors whose drag is added."""
+    """Actuators that MuJoCo simulates, with rotors whose drag is added.
+
+    Attributes:
+        upright: Place of each rotor [m], and its drag per control and velocity, if all rotors push
+            along z alone, else nothing.
+        tilted: Place [m], axis and drag of each rotor, if some push in other directions.
+    """
 
     def __init__(self, model: Any, drag: float) -> None:
         """Read the rotors from a compiled `MjModel`.
@@ -30,10 +36,10 @@ class RotorDrag(Direct):
             axis = force / thrust if thrust else force
             rotors.append((*place.tolist(), *axis.tolist(), drag * thrust))
         # All rotors are in one of the two lists: those of most robots push along z alone.
-        self._upright = [(x, y, z, drag) for x, y, z, *_, drag in rotors]
-        self._tilted = list[tuple[float, ...]]()
+        self.upright = [(x, y, z, drag) for x, y, z, *_, drag in rotors]
+        self.tilted = list[tuple[float, ...]]()
         if any(rotor[3:6] != (0.0, 0.0, 1.0) for rotor in rotors):
-            self._upright, self._tilted = [], rotors
+            self.upright, self.tilted = [], rotors
 
     def step(self, commands: Commands, readings: Readings) -> Inputs:
         """Return the commands, and the drag as a force [N] and a torque [N m].
@@ -47,7 +53,7 @@ class RotorDrag(Direct):
         v = yx * vx + yy * vy + yz * vz
         w = zx * vx + zy * vy + zz * vz
         force_x = force_y = force_z = torque_x = torque_y = torque_z = 0.0
-        for command, (x, y, z, drag) in zip(commands, self._upright, strict=False):
+        for command, (x, y, z, drag) in zip(commands, self.upright, strict=False):
             scale = -drag * abs(command)  # without the part along the axis, which is 0
             fx, fy = scale * (u + q * z - r * y), scale * (v + r * x - p * z)
             force_x += fx
@@ -55,7 +61,7 @@ class RotorDrag(Direct):
             torque_x -= z * fy
             torque_y += z * fx
             torque_z += x * fy - y * fx
-        for command, (x, y, z, ax, ay, az, drag) in zip(commands, self._tilted, strict=False):
+        for command, (x, y, z, ax, ay, az, drag) in zip(commands, self.tilted, strict=False):
             hub_x, hub_y, hub_z = u + q * z - r * y, v + r * x - p * z, w + p * y - q * x
             along = hub_x * ax + hub_y * ay + hub_z * az
             scale = -drag * abs(command)

@@ -16,7 +16,7 @@ from typing import Any
 
 from cloudrc.config.schema import Positive
 from cloudrc.messages import Vector
-from cloudrc.sim.onboard import Commands
+from cloudrc.sim.onboard import Accelerator, Commands, Direct
 from cloudrc.sim.readings import Readings
 from cloudrc.sim.wheels import Wheel, read_wheels
 
@@ -38,6 +38,8 @@ class DiffDrive:
 
     Attributes:
         stopped: Commands of wheels at rest.
+        wheels: Place of each wheel to the left of the base [m], and command per speed.
+        lead: 1 if the front leads, -1 if the back leads.
     """
 
     obeys_yaw = False
@@ -48,16 +50,22 @@ class DiffDrive:
         `turn_gain` is in [1/s], `turn_rate_max` in [rad/s]; `build` describes them.
         """
         self.stopped: Commands = (0.0,) * len(wheels)
-        self._wheels = [(wheel.y, wheel.command) for wheel in wheels]
+        self.wheels = [(wheel.y, wheel.command) for wheel in wheels]
         self._turn_gain = turn_gain
         self._speed_max = min(wheel.speed_max for wheel in wheels)
         self._half_track = max(abs(wheel.y) for wheel in wheels)
         self._turn_rate_max = min(turn_rate_max, self._speed_max / self._half_track)
-        self._lead = 1.0
+        self.lead = 1.0
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """The constants of `native/diff_drive.c`, in its order."""
+        limits = self._turn_rate_max, self._speed_max, self._half_track
+        return SLOW, NEAR_REST, KEEP_END, self._turn_gain, *limits
 
     def reset(self) -> None:
         """Let the front lead."""
-        self._lead = 1.0
+        self.lead = 1.0
 
     def update(self, readings: Readings, velocity: Vector, yaw_rate: float) -> Commands:
         """Return the wheels' speeds [rad/s] that turn the robot towards a velocity and drive.
@@ -70,12 +78,12 @@ class DiffDrive:
         ahead = x * ahead_x + y * ahead_y
         left = y * ahead_x - x * ahead_y
         speed = hypot(ahead, left)
-        if self._lead * ahead < -KEEP_END * speed:
-            self._lead = -self._lead
+        if self.lead * ahead < -KEEP_END * speed:
+            self.lead = -self.lead
         share = min(speed / SLOW, 1.0)
         if yaw_rate and speed < NEAR_REST:
             share = 0.0
-        angle = atan2(self._lead * left, self._lead * ahead)
+        angle = atan2(self.lead * left, self.lead * ahead)
         turn = share * self._turn_gain * angle + (1.0 - share) * yaw_rate
         return self._wheel_speeds(ahead, turn)
 
@@ -89,7 +97,7 @@ class DiffDrive:
         turn = most if turn > most else -most if turn < -most else turn
         rest = self._speed_max - abs(turn) * self._half_track
         ahead = max(min(ahead, rest), -rest)
-        return tuple([(ahead - turn * y) * command for y, command in self._wheels])
+        return tuple([(ahead - turn * y) * command for y, command in self.wheels])
 
 
 def build(
@@ -114,3 +122,15 @@ def build(
         ValueError: If the model has no such wheels.
     """
     return DiffDrive(read_wheels(model, wheel_radius_m), turn_gain, turn_rate_max)
+
+
+def accelerator() -> Accelerator:
+    """Return what runs the usual steps in C, if this machine can."""
+    from cloudrc.robots.native.robot import accelerate
+    from cloudrc.robots.onboard._twins import DiffDriveTwin
+
+    return accelerate(DiffDriveTwin, "rover", _example)
+
+
+def _example(model: Any) -> tuple[DiffDrive, Direct]:
+    return build(model), Direct(model.nu)

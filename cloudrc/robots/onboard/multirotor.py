@@ -17,7 +17,7 @@ from cloudrc.messages import ZERO, Vector
 from cloudrc.robots.onboard._allocation import Allocation
 from cloudrc.robots.onboard._drag import RotorDrag
 from cloudrc.sim.airframe import Airframe, read_airframe
-from cloudrc.sim.onboard import Actuators, Commands, Direct
+from cloudrc.sim.onboard import Accelerator, Actuators, Commands, Direct
 from cloudrc.sim.readings import Readings
 
 VELOCITY_RADPS, ATTITUDE_RADPS, YAW_RADPS = 5.0, 20.0, 4.0
@@ -48,6 +48,8 @@ BRAKING = 3.0
 YAW_LEAD_MAX = 0.5
 """Largest difference between the yaw reference and the yaw [rad]."""
 TINY = 1e-9
+SPIN_MAX = 50.0
+"""Largest angular velocity in free air [rad/s], for `acceleration_max`."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,8 @@ class Multirotor:
 
     Attributes:
         gains: Bandwidths and limits.
+        allocation: Turns accelerations into controls.
+        acceleration_max: Largest acceleration in free air [m/s^2], with reserve.
         stopped: Controls while the guard has stopped the robot.
         obeys_yaw: Whether it follows a yaw rate.
     """
@@ -86,7 +90,7 @@ class Multirotor:
         self.gains = gains
         self.stopped = allocation.stopped
         self.obeys_yaw = gains.yaw > 0.0
-        self._allocate = allocation.allocate
+        self.allocation, self._allocate = allocation, allocation.allocate
         self._dt = dt
         self._gravity = gravity = frame.gravity
         self._drag = drag * gravity  # deceleration of a hovering robot per velocity [1/s]
@@ -104,6 +108,8 @@ class Multirotor:
         self._bandwidths = b, climb, 0.5 * gains.attitude * dt, 0.25 * b * b, 0.25 * climb * climb
         x, y, z = frame.centre.tolist()
         self._centre = (x, y, z)
+        turning = SPIN_MAX * SPIN_MAX * hypot(x, y, z)
+        self.acceleration_max = 2.0 * (allocation.acceleration_max + gravity + turning)
         self.reset()
 
     def reset(self) -> None:
@@ -112,6 +118,29 @@ class Multirotor:
         self._lagging = (0.0, 0.0)  # planned horizontal velocity, after the lag of the tilt [m/s]
         self._integral = ZERO  # [m/s^2]
         self._yaw: float | None = None  # yaw reference [rad]
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """The constants of `native/multirotor.c`, in its order."""
+        b, climb, part, gain, gain_z = self._bandwidths
+        limits = self._thrust_max, self._slope_max, self._lead_max, self._climb_lead_max
+        planned = self._rise_max, self._planned_max, self._sink_max
+        forces = self._up_min, self._heave_max, self._thrust_square
+        gains = b, climb, part, gain, gain_z, self.gains.attitude, self.gains.yaw
+        common = WIND, TINY, YAW_LEAD_MAX, *self._centre
+        return self._dt, self._gravity, self._drag, *limits, *planned, *forces, *gains, *common
+
+    @property
+    def memory(self) -> tuple[float, ...] | None:
+        """Plan, plan after the lag, integral and yaw reference, shape (9,); None after a reset."""
+        if self._plan is None or self._yaw is None:
+            return None
+        return *self._plan, *self._lagging, *self._integral, self._yaw
+
+    @memory.setter
+    def memory(self, numbers: tuple[float, ...]) -> None:
+        x, y, z, lag_x, lag_y, ix, iy, iz, self._yaw = numbers
+        self._plan, self._lagging, self._integral = (x, y, z), (lag_x, lag_y), (ix, iy, iz)
 
     def update(self, readings: Readings, velocity: Vector, yaw_rate: float) -> Commands:
         """Return the controls that make the robot follow a velocity; call once per time step.
@@ -290,6 +319,19 @@ def actuators(model: Any, dt: float, *, drag_s_per_m: float = 0.0) -> Actuators:
     `dt` is the duration of a step [s]. `drag_s_per_m` is the drag [s/m] as in `build`.
     """
     return RotorDrag(model, drag_s_per_m) if drag_s_per_m else Direct(model.nu)
+
+
+def accelerator() -> Accelerator:
+    """Return what runs the usual steps in C, if this machine can."""
+    from cloudrc.robots.native.robot import accelerate
+    from cloudrc.robots.onboard._twins import MultirotorTwin
+
+    return accelerate(MultirotorTwin, "x2", _example)
+
+
+def _example(model: Any) -> tuple[Multirotor, RotorDrag]:
+    drag = 0.03
+    return build(model, drag_s_per_m=drag), RotorDrag(model, drag)
 
 
 def _checked(name: str, wanted: float | None, default: float, most: float) -> float:

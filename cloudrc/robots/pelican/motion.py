@@ -25,6 +25,7 @@ from cloudrc.cloud.motion import Body
 from cloudrc.config.schema import NotNegative, NotNegatives, Positive
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Odometry, Vector
+from cloudrc.robots.native.library import Library, library
 from cloudrc.robots.pelican.low_level import (
     GAIN_D,
     GAIN_I,
@@ -37,7 +38,6 @@ from cloudrc.robots.pelican.low_level import (
     ROBOT_MASS,
     TILT_RATE_GAIN,
 )
-from cloudrc.robots.pelican.native.library import Library, library
 from cloudrc.robots.pelican.rotors import TIME_CONSTANT_DOWN, TIME_CONSTANT_UP
 from cloudrc.world.guard.limits import LOW_HEIGHT, LOW_SPEED, SINK_LEAD_MAX
 
@@ -65,7 +65,7 @@ CONSTANTS = (
     TIME_CONSTANT_DOWN, DRAG, THRUST_MAX, TILT_RATE_GAIN, FLOOR_MARGIN, LOW_HEIGHT, LOW_SPEED,
     SINK_LEAD_MAX,
 )  # fmt: skip
-"""The first numbers of the structure `Body` of `native/motion.c`."""
+"""The first numbers of the structure `Body` of `robots/native/motion.c`."""
 _STATE, _VECTOR = Struct("24d"), Struct("3d")
 GAIN_ACCELERATION, GAIN_TORQUE = 0.3, 0.1
 """Rates at which the estimated acceleration and torque follow the errors of a prediction [1/s]. The
@@ -76,7 +76,7 @@ class WhiteBox(Body):
     """Model of the robot and of its onboard controller, which holds the yaw at 0.
 
     The body rates turn the axis of the thrust: a unit vector (nx, ny, nz) in the world frame.
-    `native/motion.c` advances it under many commands at once, with the same bits.
+    `robots/native/motion.c` advances it under many commands at once, with the same bits.
     """
 
     def __init__(
@@ -210,7 +210,7 @@ class WhiteBox(Body):
         return vectors[:count], vectors[count:]
 
     def _pack(self) -> array[float]:
-        """Return the numbers of the structure `Body` of `native/motion.c`, in its order."""
+        """Return the numbers of the structure `Body` of `robots/native/motion.c`, in its order."""
         return array("d", self._fixed + _STATE.pack(
             *self._missed, *self._trim, *self._reference, *self._integral,
             self._thrust, *self._torque, *self.position, *self.velocity, *self._axis, *self._rate,

@@ -82,10 +82,14 @@ def actuators(model: Any, dt: float) -> Rotors:
 
 def accelerator() -> Accelerator:
     """Return what runs the usual steps in C, if this machine can."""
-    from cloudrc.robots.pelican.native.robot import NativeRobot, usable
+    from cloudrc.robots.native.robot import accelerate
+    from cloudrc.robots.pelican.twin import PelicanTwin
 
-    library = usable()
-    return Accelerator(NativeRobot if library.run else None, library.text, library.code)
+    return accelerate(PelicanTwin, "pelican", _example)
+
+
+def _example(model: Any) -> tuple[LowLevel, Rotors]:
+    return LowLevel(), Rotors(model.opt.timestep)
 
 
 def advise(world: World, values: Mapping[str, Any], gains: Vector) -> Iterator[str]:

@@ -96,6 +96,7 @@ class Guard:
         state: Current state.
         cause: Why the guard is in this state; in LAND always the reason of the landing.
         fence: Box that the robot's base may not leave.
+        box: Corners of the box in which commands move the robot [m]; a planar robot has no height.
         armed: Whether a mission is active: from the operator's start to its end, LAND or ESTOP.
         reference: Velocity reference of the last step [m/s], world frame, shape (3,).
         yaw_rate: Limited yaw rate [rad/s]; not every onboard controller obeys it.
@@ -132,6 +133,7 @@ class Guard:
         self._low, self._high = fence.inner_low, fence.inner_high
         if self._planar:
             self._low, self._high = (*self._low[:2], -inf), (*self._high[:2], inf)
+        self.box = self._low, self._high
         self._floor, half = self._low[2], 0.5 * limits.speed_max_mps
         self._position_hold = PositionHold(self._low, self._high, half, self._braking)
         self._descent = Halt() if robot.stop == "brake" else Descent(self._floor, half)
@@ -349,7 +351,7 @@ class Guard:
         return self.reference
 
     def plain_track(self, now_ns: int) -> tuple[int, Vector, Vector, int] | None:
-        """Return the values with which C (`native/step.c`) runs `step` from `now_ns` [ns] on.
+        """Return the values with which C (`step.c`) runs `step` from `now_ns` [ns] on.
 
         The values are: start of the plan's next velocity [ns], velocity reference [m/s], commanded
         velocity [m/s], and end of the time in which the robot may follow the command or plan [ns].

@@ -8,8 +8,8 @@ import pytest
 from cloudrc.cloud.controllers.pid import build as pid
 from cloudrc.cloud.motion import Body, pack_goal
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
+from cloudrc.robots.native.library import Library, library
 from cloudrc.robots.pelican import motion
-from cloudrc.robots.pelican.native.library import Library, library
 from cloudrc.tunnel.codec import as_planned
 
 pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)

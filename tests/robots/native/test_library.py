@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from cloudrc.robots.pelican.native import library as module
-from cloudrc.robots.pelican.native.library import (
+from cloudrc.robots.native import library as module
+from cloudrc.robots.native.library import (
     POD,
     SWITCH,
     built_file,
