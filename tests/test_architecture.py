@@ -114,8 +114,8 @@ def test_no_file_and_no_function_is_too_long():
 
 PUBLIC = {"_asdict", "_fields", "_replace", "_exit"}
 """Names that Python documents for everybody."""
-NO_OTHER_NAME = {"_address", "_add_info", "_Writer__chunk_indices"}
-"""Of mujoco, gymnasium and mcap, which have no public name for it."""
+NO_OTHER_NAME = {"_address", "_add_info"}
+"""Of mujoco and gymnasium, which have no public name for it."""
 
 
 def private_of_others(parsed):

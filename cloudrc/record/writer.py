@@ -19,16 +19,16 @@ from contextlib import suppress
 from io import FileIO
 from operator import itemgetter
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import IO, Self
 
-from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer, Metadata
-from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
+from mcap.writer import MCAP0_MAGIC
 
 from cloudrc.files import atomic_file, open_file, try_lock
 from cloudrc.record import STOPPED, WALL_OFFSET, wall_time
 from cloudrc.record.content import Content
 from cloudrc.record.holes import HOLES, Hole, to_metadata
+from cloudrc.record.mcap_file import McapFile, bytes_of
 from cloudrc.record.ros import definition, encode, type_hash
 from cloudrc.record.topics import TOPICS, VIEWS, topics_of
 from cloudrc.records import Record
@@ -73,20 +73,13 @@ class McapWriter:
         Without `index`, the file gets no index of its chunks, and writing takes constant memory.
         """
         self._owned = isinstance(target, Path)
-        # Unbuffered: mcap's writer has its own buffer, and `abandon` writes past it.
+        # Unbuffered: `McapFile` has its own buffer, and `abandon` writes past it.
         self._stream: IO[bytes] | FileIO = (
             target.open("wb", buffering=0) if isinstance(target, Path) else target
         )
         if self._owned:
             try_lock(self._stream)
-        # Any, because mcap's writer is not annotated throughout.
-        self._mcap: Any = Writer(
-            self._stream,
-            compression=CompressionType.ZSTD,
-            enable_data_crcs=True,
-            index_types=IndexType.ALL if index else IndexType.ATTACHMENT | IndexType.METADATA,
-        )
-        self._index = index
+        self._file = McapFile(self._stream, f"cloudrc {__version__}", index=index)
         self._whole = 0  # number of bytes in the file up to the last complete chunk
         self._open_records = 0  # number of records written after these bytes
         self._schemas: dict[str, int] = {}
@@ -96,7 +89,6 @@ class McapWriter:
         self._chunk_start_ns: int | None = None
         self._number = 0  # sequence number of the last message
         self._counts: Counter[str] = Counter()
-        self._mcap.start(profile="ros2", library=f"cloudrc {__version__}")
         self.note({CLOCK: clock, "clock_id": clock_id, "version": __version__, COUNTS: ""})
         if code:
             self.note({CODE: code})
@@ -141,12 +133,12 @@ class McapWriter:
         channel = self._channels.get(topic) or self._open_channel(topic)
         # By the number, a reader restores the order of messages with equal log times.
         self._number = (self._number + 1) & 0xFFFFFFFF
-        self._mcap.add_message(channel, now_ns, data, now_ns, self._number)
+        self._file.add_message(channel, self._number, now_ns, data)
 
     def note(self, metadata: Mapping[str, str]) -> None:
         """Add values to the file's metadata; a later value of a key replaces an earlier value."""
         self._noted |= metadata
-        self._mcap.add_metadata(METADATA, dict(self._noted))
+        self._file.add_metadata(METADATA, self._noted)
 
     def note_losses(self, text: str, holes: Iterable[Hole]) -> None:
         """Note in words what is missing from the file, and the times of the missing messages."""
@@ -154,14 +146,12 @@ class McapWriter:
 
     def attach(self, name: str, data: bytes) -> None:
         """Attach a file, such as report.json, to the recording."""
-        self._mcap.add_attachment(0, self._latest_ns, name, "application/octet-stream", data)
+        self._file.attach(name, "application/octet-stream", self._latest_ns, data)
 
     def flush(self) -> None:
         """Complete the present chunk and pass it to the operating system."""
         self._chunk_start_ns = None
-        self._mcap.flush()
-        if not self._index:  # mcap keeps the list even if it does not write it
-            self._mcap._Writer__chunk_indices.clear()
+        self._file.flush()
         self._whole = self._stream.tell()
         self._open_records = 0
 
@@ -180,15 +170,12 @@ class McapWriter:
         `code` is the failure code of the reason; "" if no code names it.
         Return the number of records that were passed to `write` but are not in the file.
         """
-        note: Any = RecordBuilder()  # without type annotations
-        end: Any = RecordBuilder()
         named = {STOPPED: code} if code else {}
-        Metadata(METADATA, {MISSING: reason, **named}).write(note)
-        DataEnd(0).write(end)
-        Footer(0, 0, 0).write(end)
+        note = bytes_of(Metadata(METADATA, {MISSING: reason, **named}))
+        end = bytes_of(DataEnd(0), Footer(0, 0, 0))
         first = b"" if self._whole else MCAP0_MAGIC
         # Never write the end without the note: the file would look complete.
-        for rest in (first + note.end() + end.end() + MCAP0_MAGIC, b""):
+        for rest in (first + note + end + MCAP0_MAGIC, b""):
             with suppress(OSError, ValueError):  # no space: leave only the complete chunks
                 self._stream.seek(self._whole)
                 self._stream.truncate()
@@ -202,9 +189,7 @@ class McapWriter:
         """Write the index and close the file. After an error, call `abandon` instead."""
         self.flush()  # keeps the last chunk even if there is no space for the index
         self.note({COUNTS: json.dumps(self._counts)})
-        self._mcap.finish()
-        self._mcap.flush()
-        self._stream.flush()
+        self._file.finish()
         if self._owned:
             self._stream.close()
 
@@ -222,11 +207,11 @@ class McapWriter:
         ros_type = VIEWS.get(topic) or TOPICS[topic].ros_type
         if ros_type not in self._schemas:
             text = definition(ros_type).encode()
-            self._schemas[ros_type] = self._mcap.register_schema(ros_type, "ros2msg", text)
+            self._schemas[ros_type] = self._file.add_schema(ros_type, "ros2msg", text)
         # rosbag2 writes both keys, too.
         metadata = {"offered_qos_profiles": "", "topic_type_hash": type_hash(ros_type)}
         schema = self._schemas[ros_type]
-        channel = int(self._mcap.register_channel(topic, "cdr", schema, metadata))
+        channel = self._file.add_channel(topic, "cdr", schema, metadata)
         self._channels[topic] = channel
         return channel
 
