@@ -17,15 +17,18 @@ import json
 import os
 import sys
 import time
+from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
-from itertools import pairwise
+from itertools import pairwise, repeat
 from typing import Any
 
 LIMIT_NS = 300_000_000_000
 """Time limit of a flight of the part "loop" [ns], virtual time."""
 FLY_POINT = "cloudrc.runs.flight", "cloudrc.sweep.flight"
 """Modules that may have `fly_point`."""
+WORKERS = "cloudrc.trials.workers"
+"""Module that may have `map_in_order`; earlier, a worker called `fly_point` and no more."""
 marks: list[float] = []
 """Processor time of this thread when the flight began, and every 100 ms of virtual time [s]."""
 
@@ -67,6 +70,17 @@ def fly_point(experiment: Any) -> str:
     raise ModuleNotFoundError(" and ".join(FLY_POINT))
 
 
+@cache
+def flights(experiment: str, settings: tuple[str, ...]) -> Iterator[str]:
+    """Yield the hash of one flight after the other, as a worker of a sweep flies them."""
+    again = repeat(load(experiment, settings))
+    try:
+        workers = import_module(WORKERS)
+    except ModuleNotFoundError:
+        return map(fly_point, again)
+    return workers.map_in_order(fly_point, again, 1)  # type: ignore[no-any-return]
+
+
 def fly_loop(experiment: Any) -> None:
     """Fly, and keep the records in memory."""
     from cloudrc.assembly import assemble
@@ -94,7 +108,7 @@ def measure(experiment: str, settings: tuple[str, ...], part: str) -> dict[str, 
     gc.collect()
     marks.clear()
     before = time.thread_time()
-    fly_point(resolved) if part == "sweep" else fly_loop(resolved)
+    next(flights(experiment, settings)) if part == "sweep" else fly_loop(resolved)
     after = time.thread_time()
     ends = [before, *marks, after] if part == "sweep" else marks
     pieces = [end - begin for begin, end in pairwise(ends)]

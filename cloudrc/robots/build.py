@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import inspect
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from cloudrc.config.shipped import ROBOT_FILE, file_of
 from cloudrc.messages import ZERO, Vector
 from cloudrc.outside.document import KeyPath
 from cloudrc.outside.refusal import naming
+from cloudrc.outside.reuse import reuse
 from cloudrc.outside.values import RESULT
 from cloudrc.sim.airframe import thrust_to_weight
 from cloudrc.sim.energy import EnergyMeter, power_factors
@@ -51,9 +53,11 @@ def check_robot(world: World, *, turns: bool = False) -> None:
 
 def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:
     """Compile the robot that flies or drives in a scene, and build it, guarded by `limits`."""
-    robot, scene = known_robot(world.robot), file_of(world.scene)
+    robot = known_robot(world.robot)
+    files = robot.model, file_of(world.scene)
     with naming(f"robot {world.robot}"):
-        nominal = compile_model(robot.model, scene)
+        # A copy, because an onboard controller of a user gets it, and may change it.
+        nominal = copy(reuse(("model", *files), lambda: compile_model(*files)))
     with at_key("world.robot", f"{_file_of(world)}: onboard: "):
         # The build below uses the same import of the file.
         plugin = plugins.find(KIND, robot.onboard.name)

@@ -12,13 +12,14 @@ import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from itertools import chain, islice
 from types import ModuleType
 from typing import Any, TypeVar
 
 from cloudrc.drivers.machine import usable_cores
 from cloudrc.errors import CloudrcError, InterruptedRunError, InvalidRunError, machine_error
+from cloudrc.outside.reuse import reuse_results
 from cloudrc.runs.interrupts import is_interrupted, noted_interrupts, raise_if_interrupted
 
 Work = TypeVar("Work")
@@ -29,12 +30,19 @@ PERIOD = 0.1
 """Longest time between a signal and the end of a wait for a worker [s]."""
 
 
+_of_worker = ExitStack()  # ends with the process
+
+
 class WorkerDiedError(InvalidRunError):
     """Report that a worker process was killed or ended itself."""
 
 
 def _start_worker() -> None:
-    """Let this worker process end with the parent process, even if SIGKILL ended the parent."""
+    """Let this worker process end with the parent process, even if SIGKILL ended the parent.
+
+    Until then, it reuses what its calls share, such as the compiled model of a robot.
+    """
+    _of_worker.enter_context(reuse_results())
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -82,9 +90,10 @@ def map_in_order(
     first = [*islice(rest, WINDOW)]
     workers, every = min(jobs, len(first), usable_cores()), chain(first, rest)
     if workers <= 1:
-        for result in map(function, every):
-            raise_if_interrupted()
-            yield result
+        with reuse_results():  # as a worker does
+            for result in map(function, every):
+                raise_if_interrupted()
+                yield result
         return
     with noted_interrupts():
         yield from _map_in_workers(function, every, workers, in_order)

@@ -9,8 +9,11 @@ import cloudrc
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import World
+from cloudrc.outside.reuse import reuse_results
+from cloudrc.robots import build
 from cloudrc.robots.build import build_robot
 from cloudrc.sim.airframe import read_airframe
+from cloudrc.sim.scene import compile_model
 
 STEPS = {"mission.steps.count": 3, "link.profile": "paper-p2"}
 
@@ -61,3 +64,20 @@ def test_the_rotors_of_the_nano_push_and_turn_as_those_of_a_crazyflie():
     roll, pitch, _, yaw = frame.wrench
     signs = np.sign([roll, pitch, yaw]).T.astype(int)
     assert dict(zip(frame.names, map(tuple, signs.tolist()), strict=True)) == mixer
+
+
+def test_flights_of_a_sweep_share_the_compiled_model_as_copies(monkeypatch):
+    """An onboard controller of a user may change the model that it gets."""
+    compiled = []
+    monkeypatch.setattr(
+        build,
+        "compile_model",
+        lambda *files: compiled.append(compile_model(*files)) or compiled[-1],
+    )
+    world, limits = World.model_validate({"robot": "x2", "scene": "empty"}), ResolvedGuard()
+    with reuse_results():
+        first, second = (build_robot(world, limits).simulator.model for _ in range(2))
+    assert len(compiled) == 1
+    first.body_mass[:] = 0.0
+    assert second.body_mass.any()
+    assert compiled[0].body_mass.any()

@@ -10,6 +10,7 @@ from functools import partial
 
 import pytest
 
+from cloudrc.outside.reuse import reuse
 from cloudrc.trials.workers import map_in_order, take_each
 from tests.conftest import wait_until
 
@@ -46,6 +47,17 @@ def test_results_keep_the_order_of_the_work(pieces, jobs, workers, monkeypatch):
     numbers, pids = zip(first, *done, strict=True)
     assert numbers == tuple(range(pieces))
     assert (os.getpid() in pids) is (workers == 0)
+
+
+def _shared(number):
+    return reuse("shared", lambda: (number, os.getpid()))
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_worker_computes_once_what_its_calls_share(jobs):
+    found = {*map_in_order(_shared, range(6), jobs)}
+    assert len(found) == len({pid for _, pid in found}) <= jobs
+    assert _shared(9) == (9, os.getpid()), "nothing is kept afterwards"
 
 
 def test_results_before_a_worker_was_killed_are_kept(tmp_path):
