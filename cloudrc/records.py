@@ -60,7 +60,7 @@ class LinkChecked(NamedTuple):
 
     Cloud judges the uplink, and world judges the downlink, from the datagrams of the last 60 s. The
     quantity is "mean", "deviation", "round_trip", "loss", "reordered" or "duplicated", or one that
-    is not judged: "time_line", "rate", "correlation".
+    is not judged: "time_line", "radio", "rate", "correlation".
 
     The verdict is "ok", "off" or "open", or "told" for a quantity that is not judged. "open" means
     that there are too few datagrams, that the next check has to confirm "off", or that "off" may

@@ -12,7 +12,7 @@ from typing import Any
 
 from cloudrc.config.compute import read_times
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
-from cloudrc.eval.setup import FILE, MEASURED, SEED, Compute
+from cloudrc.eval.setup import FILE, MEASURED, SEED, Compute, radio_ms
 from cloudrc.gym.options import ANSWER
 from cloudrc.link.library import read_profile
 from cloudrc.outside.address import check_url
@@ -72,6 +72,11 @@ def check_round_trips(profile: str, round_trips: tuple[float | None, ...]) -> No
         raise BadInputError(
             f"--rtt: the delays of the profile '{profile}' change over time; leave --rtt out, or "
             "choose a profile with constant delays"
+        )
+    given, least = [each for each in round_trips if each is not None], radio_ms(link)
+    if min(given, default=least) < least:
+        raise BadInputError(
+            f"--rtt: the radio of the profile '{profile}' alone takes {least:.4g} ms; give more"
         )
 
 

@@ -80,5 +80,5 @@ def _drawn(options: Options, kind: str) -> tuple[str, str, bytes]:
     about, ways = sample_profile(options.profile, settings, tell)
     title = escape(": ".join(filter(None, (Path(options.profile).stem, about))))
     picture = render_link(title, [sample for sample, _ in ways.values()], kind)
-    text = statistics_table({name: numbers for name, (_, numbers) in ways.items()})
+    text = statistics_table(ways)
     return title, text, picture

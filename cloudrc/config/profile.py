@@ -29,6 +29,7 @@ from cloudrc.link.profile import (
     NotNegative,
     Probability,
     ProfileKeys,
+    Radio,
     refuse_period,
 )
 from cloudrc.link.profile import CloudTime as CloudTime
@@ -45,9 +46,9 @@ FILE_READERS: dict[str, Callable[[Path], object]] = {
 """Key whose value is the path of a data file -> function that reads and checks the file."""
 
 
-LATER_KEYS = ("rate_trace", "repeat_s")
+LATER_KEYS = ("rate_trace", "repeat_s", "radio")
 """Keys of a direction that are left out where they are null, as before there were any."""
-_Keys = TypeVar("_Keys", GilbertElliott, DirectionKeys, ProfileKeys)
+_Keys = TypeVar("_Keys", GilbertElliott, DirectionKeys, ProfileKeys, Radio)
 
 
 def _refuse_conflict(keys: _Keys) -> _Keys:
@@ -83,17 +84,6 @@ class ChangeConfig(Section, Change):
     loss: LossConfig | None = None
 
 
-class DirectionConfig(Section, DirectionKeys):
-    """Network conditions of one direction. All delays are ONE WAY."""
-
-    loss: LossConfig = 0.0
-    changes: tuple[ChangeConfig, ...] = ()
-    blackouts: tuple[BlackoutConfig, ...] = ()
-
-    _agree = model_validator(mode="after")(_refuse_conflict)
-    _write = leave_out_empty(*LATER_KEYS)
-
-
 def _start_tag(value: Any) -> str:
     return "<word>" if isinstance(value, str) else "<time>"
 
@@ -102,6 +92,26 @@ StartConfig = Annotated[
     Annotated[NotNegative, Tag("<time>")] | Annotated[Literal["random"], Tag("<word>")],
     Discriminator(_start_tag),
 ]
+
+
+class RadioConfig(Section, Radio):
+    """A radio that schedules: it has slots for one direction at a time, and grants them."""
+
+    phase_ms: StartConfig = 0.0
+
+    _agree = model_validator(mode="after")(_refuse_conflict)
+
+
+class DirectionConfig(Section, DirectionKeys):
+    """Network conditions of one direction. All delays are ONE WAY."""
+
+    loss: LossConfig = 0.0
+    radio: RadioConfig | None = None
+    changes: tuple[ChangeConfig, ...] = ()
+    blackouts: tuple[BlackoutConfig, ...] = ()
+
+    _agree = model_validator(mode="after")(_refuse_conflict)
+    _write = leave_out_empty(*LATER_KEYS)
 
 
 class Profile(Section, ProfileKeys):

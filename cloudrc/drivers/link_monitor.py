@@ -182,24 +182,27 @@ class LinkMonitor:
         return checked
 
     def _rows(self) -> list[Judgement]:
-        """Judge all quantities; the row "time_line" tells that a profile changes over time.
+        """Judge all quantities; rows tell of a profile that changes over time, and of a radio.
 
         Delays are judged only if world and cloud share a clock, and without compute time.
         """
         stream, first, timed = _in_order(self._arrivals, self._period)
         rows, skipped = list[Judgement](), UNJUDGED
-        if not timed or (self._computes and not self._uplink):
+        has_radio = any(one.radio for one in self._asked or ())
+        if has_radio or not timed or (self._computes and not self._uplink):
             skipped = UNJUDGED | DELAYS
         if len(stream.sent) >= FEWEST:
             rows = self._plans[0].judge(stream, self._epoch, first)
         elif self._arrivals:  # a new session or profile ends the old verdict
             rows = [told("loss", nan)._replace(verdict="open")]
         rows = [row for row in rows if row.name not in skipped]
-        if not timed and not self._computes and len(self._trips) >= FEWEST:
+        if not timed and not self._computes and not has_radio and len(self._trips) >= FEWEST:
             rows.append(self._round_trip())
         rows = [self._excuse(row) for row in rows]
         if any(Timeline(one).only() is None for one in self._asked or ()):
             rows.append(told("time_line", 1))
+        if has_radio:  # its phase counts from a time that is not known here
+            rows.append(told("radio", 1))
         return rows
 
     def _round_trip(self) -> Judgement:

@@ -13,6 +13,7 @@ from typing import Any
 from cloudrc import source
 from cloudrc.eval.setup import EvalSetup
 from cloudrc.link.library import read_profile
+from cloudrc.link.profile import DirectionProfile
 from cloudrc.report.document import versions
 from cloudrc.version import __version__
 
@@ -38,8 +39,13 @@ def provenance(setup: EvalSetup, command: str) -> dict[str, Any]:
         "command": command,
         "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
         "profile": {
-            name: asdict(replace(way, rows=None, quantiles=(), opportunities=()))
-            for name, way in (("uplink", link.uplink), ("downlink", link.downlink))
+            name: _keys(way) for name, way in (("uplink", link.uplink), ("downlink", link.downlink))
         },
         "cite": CITE,
     }
+
+
+def _keys(way: DirectionProfile) -> dict[str, Any]:
+    """Return the keys of a direction without the contents of files; `radio` if there is one."""
+    keys = asdict(replace(way, rows=None, quantiles=(), opportunities=()))
+    return {key: value for key, value in keys.items() if key != "radio" or value}

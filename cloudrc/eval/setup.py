@@ -18,6 +18,7 @@ from cloudrc.gym.options import ANSWER
 from cloudrc.gym.step import StepTime
 from cloudrc.link.library import PACKET_BYTES, LinkProfile, read_profile
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.radio import mean_delay
 from cloudrc.outside.code import sources
 from cloudrc.outside.reuse import reuse
 from cloudrc.plugins import is_path
@@ -173,18 +174,25 @@ def _code_of_link(link: LinkProfile) -> str:
     """Return the hash of a profile with the contents of its files, wherever they are."""
     both = link.uplink, link.downlink
     ways = [replace(way, trace=None, table=None, rate_trace=None) for way in both]
-    return sha256(repr([*ways, link.start_s]).encode()).hexdigest()
+    radios = [[way.radio for way in both]] * any(way.radio for way in both)  # not in a repr
+    return sha256(repr([*ways, link.start_s, *radios]).encode()).hexdigest()
+
+
+def radio_ms(link: LinkProfile) -> float:
+    """Return the mean round trip in the radios of a link [ms]."""
+    return 1e3 * (mean_delay(link.uplink, True) + mean_delay(link.downlink, False))
 
 
 def link_at(profile: str, rtt_ms: float | None) -> LinkProfile:
     """Return a link profile with the mean round trip `rtt_ms` [ms]; None: as it is.
 
-    The two delays keep the ratio of the profile. Jitter, loss and rate stay, but no jitter is
-    larger than its delay, which would raise the mean.
+    The two delays keep the ratio of the profile; a radio has its part of the round trip. Jitter,
+    loss and rate stay, but no jitter is larger than its delay, which would raise the mean.
     """
     link = read_profile(profile)
     if rtt_ms is None:
         return link
+    rtt_ms -= radio_ms(link)
     both = link.uplink, link.downlink
     whole = sum(way.delay_ms for way in both)
     share = link.uplink.delay_ms / whole if whole else 0.5

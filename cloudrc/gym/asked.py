@@ -73,7 +73,7 @@ def expected(wire: Wire, period: float, count: int = 0) -> tuple[float, float]:
     """
     profile, pieces = wire.profile, wire.cut.usual
     if wire.is_plain:
-        asked = OneWay(profile, 0, uplink=True).expected(period, wire.size)
+        asked = OneWay(profile, 0, wire.asked_uplink).expected(period, wire.size)
         return asked.mean, asked.loss
     sent_ns = np.arange(count or max(MESSAGES_MIN, PIECES // pieces)) * round(period * 1e9)
     delays = _delays_of(wire, sent_ns.tolist(), 0)
@@ -89,8 +89,9 @@ def expected(wire: Wire, period: float, count: int = 0) -> tuple[float, float]:
 def _delays_of(wire: Wire, sent_ns: list[int], episode: int) -> Floats:
     """Send messages at these times [ns] through the model; return their delays [s], NaN if lost."""
     if wire.is_plain:
-        link = LinkDirection(wire.profile, 0, True, stream=" asked")
-        return sample(link, KIND, sent_ns, wire.size, epoch=episode).delays
+        link = LinkDirection(wire.profile, 0, wire.asked_uplink, stream=" asked")
+        turn = wire.profile.phase_packets
+        return sample(link, KIND, sent_ns, wire.size, epoch=episode, turn=turn).delays
     lane, delays = Lane(wire, 0, " expected"), np.full(len(sent_ns), nan)
     lane.begin(episode)
     for number, now_ns in enumerate(sent_ns):
@@ -142,8 +143,10 @@ class PartsAsked:
 
 
 def _is_coupled(profile: DirectionProfile, timeline: Timeline) -> bool:
-    """Return whether the delay of a packet depends on those before it."""
+    """Return whether the delay of a packet depends on its time, or on those before it."""
     has_rate = profile.opportunities or any(each.rate is not None for each in timeline.pieces)
+    if profile.radio:
+        return True
     return bool(has_rate) or (profile.keep_order and any(each.jitter for each in timeline.pieces))
 
 

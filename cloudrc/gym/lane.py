@@ -36,6 +36,11 @@ class Wire(NamedTuple):
         return self.link.uplink if self.uplink else self.link.downlink
 
     @property
+    def asked_uplink(self) -> bool:
+        """Whether what it asks for has the random numbers of an uplink; with a radio, its own."""
+        return self.uplink or self.profile.radio is None
+
+    @property
     def cut(self) -> Cut:
         """How messages are cut into packets."""
         return Cut(self.packet_bytes).for_size(self.size)

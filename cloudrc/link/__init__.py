@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cloudrc.link.library import LinkProfile, OneWay, open, read_profile
-    from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Trace
+    from cloudrc.link.profile import (
+        Blackout,
+        Change,
+        DirectionProfile,
+        GilbertElliott,
+        Radio,
+        Trace,
+    )
     from cloudrc.link.queue import PacketQueue
     from cloudrc.link.streams import Numbers
 
@@ -17,7 +24,7 @@ _HOMES = {
     **dict.fromkeys(("LinkProfile", "OneWay", "open", "read_profile"), "library"),
     "Numbers": "streams",
     **dict.fromkeys(
-        ("Blackout", "Change", "DirectionProfile", "GilbertElliott", "Trace"), "profile"
+        ("Blackout", "Change", "DirectionProfile", "GilbertElliott", "Radio", "Trace"), "profile"
     ),
     "PacketQueue": "queue",
 }
@@ -32,6 +39,7 @@ __all__ = [
     "Numbers",
     "OneWay",
     "PacketQueue",
+    "Radio",
     "Trace",
     "open",
     "read_profile",

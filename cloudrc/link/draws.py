@@ -56,6 +56,8 @@ class Purpose(IntEnum):
     REORDER = 5
     CORRUPT = 6
     CORRUPT_BIT = 7
+    RADIO = 8
+    COPY_RADIO = 9
 
 
 def stream_key(seed: int, uplink: bool, epoch: int, kind: int, stream: str = "") -> StreamKey:

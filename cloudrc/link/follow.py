@@ -70,6 +70,11 @@ def publish_state(
 
     `before` is its state until then. `facts` are the other fields of the state.
     """
+    radio = 0.0
+    if loaded.direction.radio:
+        from cloudrc.link.radio import mean_delay  # here: it needs numpy
+
+        radio = mean_delay(loaded.direction, facts["direction"] == "uplink")
     state = LinkState(
         **facts,
         profile=loaded.values,
@@ -78,7 +83,7 @@ def publish_state(
         changes=before.changes + 1 if before else 0,
         change=loaded.change.number,
         cause=loaded.change.cause if before else "",
-        asked=summary(loaded.direction),
+        asked=summary(loaded.direction, radio),
     )
     publish(to_text(state), file)
     return state

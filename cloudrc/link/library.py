@@ -320,7 +320,8 @@ class OneWay:
         """Compute what the profile asks for: statistics of 10,000 packets from the model.
 
         The random numbers are not those of the episodes. The packets leave once per `period` [s]
-        from the start of the time line on and have `size` bytes.
+        from the start of the time line on and have `size` bytes. They meet many phases of a radio
+        whose phase is random.
         """
         from cloudrc.link.streams import numbers, sample
 
@@ -329,7 +330,8 @@ class OneWay:
             self.profile, self._seed, self._uplink, stream=f"{self._stream} expected"
         )
         period_ns = _to_ns(period)
-        return numbers(sample(link, KIND, range(0, _PACKETS * period_ns, period_ns), size))
+        sent_ns = range(0, _PACKETS * period_ns, period_ns)
+        return numbers(sample(link, KIND, sent_ns, size, turn=self.profile.phase_packets))
 
     def _begin(self, episode: int) -> None:
         self._episode, self._link, self._usual = episode, self._new(episode), None

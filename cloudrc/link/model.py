@@ -10,9 +10,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from cloudrc.link.draws import BLOCK, OVERTAKES, Fate, bit_flips, impairments, stream_key
 from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
+
+if TYPE_CHECKING:
+    from cloudrc.link.radio import RadioParts, Schedule
 
 HEADER_BYTES = 28  # size of the IPv4 and UDP headers (RFC 791, RFC 768), also on the wire [bytes]
 _BYTE = b"\0"  # stands for the content of a packet
@@ -100,8 +104,13 @@ class LinkDirection:
             from cloudrc.link.opportunities import Opportunities  # here: few links need it
 
             self._opportunities = Opportunities(times_ns)
+        self._radio: Schedule | None = None
+        if profile.radio:
+            from cloudrc.link.radio import schedule
+
+            self._radio = schedule(profile.radio, self._uplink)
         has_rate = times_ns or any(p.rate is not None for p in self._timeline.pieces)
-        self._plain = not profile.keep_order and not has_rate
+        self._plain = not profile.keep_order and not has_rate and not profile.radio
         self._fates: dict[tuple[int, int, int, float, Loss], list[Fate]] = {}
         self._place: tuple[int, int, int, Conditions] | None = None
 
@@ -128,10 +137,14 @@ class LinkDirection:
         if len(fate) == 1 and self._plain:  # nearly all packets: save time
             delay_ns = conditions.delay_ns + fate[0]
             return (now_ns + delay_ns if delay_ns > 0 else now_ns,)
+        packet = epoch, kind, counter
         if len(fate) == 1:
-            arrival = self._arrival(fate[0], conditions, size, now_ns)
+            arrival = self._arrival(fate[0], conditions, size, now_ns, packet, 0)
             return () if arrival is None else (arrival,)
-        arrivals = [self._arrival(entry, conditions, size, now_ns) for entry in fate]
+        arrivals = [
+            self._arrival(entry, conditions, size, now_ns, packet, copy)
+            for copy, entry in enumerate(fate)
+        ]
         return tuple([arrival for arrival in arrivals if arrival is not None])
 
     def send_pieces(
@@ -167,13 +180,17 @@ class LinkDirection:
 
     @property
     def shortest_ns(self) -> int:
-        """A time that no packet's delay is below [ns]: the delay less the largest jitter."""
+        """A time that no packet's delay is below [ns]: the delay less the largest jitter.
+
+        A radio adds the shortest time in it.
+        """
         profile = self._profile
         least = -profile.quantiles[0] if profile.quantiles else 0.0
         spread = {"uniform": 1.0, "normal": 9.0, "pareto": 0.7, "table": least}
         below = spread[profile.distribution] * 1e9
         delays = (piece.delay_ns - below * piece.jitter for piece in self._timeline.pieces)
-        return 0 if profile.reorder else max(0, int(min(delays)) - 1)
+        air_ns = self._radio.span.least if self._radio else 0
+        return 0 if profile.reorder else max(0, int(min(delays)) - 1) + air_ns
 
     def corrupted(self, epoch: int, kind: int, counter: int, data: bytes) -> bytes:
         """Return the content of a datagram as it arrives: unchanged, or with one bit flipped.
@@ -194,11 +211,38 @@ class LinkDirection:
         damaged[bit >> 3] ^= 1 << (bit & 7)
         return bytes(damaged)
 
-    def _arrival(self, entry: int, conditions: Conditions, size: int, now_ns: int) -> int | None:
+    def radio_parts(
+        self, epoch: int, kind: int, counter: int, now_ns: int, copy: int = 0
+    ) -> RadioParts | None:
+        """Return the parts of the delay that a packet has in the radio; None without a radio.
+
+        `now_ns` is when it enters the radio [ns]: when it is sent, or leaves the bottleneck. `copy`
+        is 1 for the copy of a duplicated packet.
+        """
+        radio = self._profile.radio
+        if self._radio is None or radio is None:
+            return None
+        from cloudrc.link.radio import phase_ns, repetitions
+
+        block, index = divmod(counter, BLOCK)
+        seed, uplink, stream = self._seed, self._uplink, self._stream
+        repeats = repetitions(radio.error, seed, uplink, epoch, kind, stream, block, copy)[index]
+        phase = phase_ns(radio, seed, uplink, epoch, stream)
+        return self._radio.split(now_ns - (self._origin_ns or 0), phase, repeats)
+
+    def _arrival(
+        self,
+        entry: int,
+        conditions: Conditions,
+        size: int,
+        now_ns: int,
+        packet: tuple[int, int, int],
+        copy: int,
+    ) -> int | None:
         """Compute when one copy of a packet arrives [ns]; None if the queue is full.
 
-        `entry` is the extra delay of the copy [ns]; if it is OVERTAKES, the copy skips queue and
-        delay.
+        `entry` is the extra delay of the copy [ns]; if it is OVERTAKES, the copy skips queue, radio
+        and delay. `packet` has epoch, kind and counter.
         """
         arrival = now_ns
         if entry != OVERTAKES:
@@ -212,6 +256,8 @@ class LinkDirection:
             if departure is None:
                 return None
             arrival = departure
+            if self._radio is not None:
+                arrival += sum(self.radio_parts(*packet, departure, copy) or ())
             delay_ns = conditions.delay_ns + entry
             if delay_ns > 0:
                 arrival += delay_ns

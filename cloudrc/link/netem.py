@@ -170,6 +170,7 @@ def check(profile: DirectionProfile) -> None:
     beyond = {
         "a time line that goes round (loop, or start_s: random)": profile.loop,
         "rate_trace": bool(profile.opportunities),
+        "radio (slots, requests and grants)": profile.radio is not None,
         "loss.delay_bad_ms (more delay while a burst of losses lasts)": any(
             isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad_ms for piece in pieces
         ),

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import pairwise
 from math import inf
@@ -35,6 +35,8 @@ Start = NotNegative | Literal["random"]
 """Where a time line begins: a time [s], or `RANDOM`."""
 
 
+PHASE_PACKETS = 10
+"""Number of packets that a simulation sends at each of many random phases of a radio."""
 PERIOD_KEYS = ("repeat_s", "trace", "rate_trace")
 """Keys of a direction that give its time line a period."""
 
@@ -73,6 +75,48 @@ class Blackout:
     """Start, in time since the link came up [s]"""
     duration_s: Positive
     """Length [s]"""
+
+
+@dataclass(frozen=True)
+class Radio:
+    """A radio that schedules: it has slots for one direction at a time, and grants them.
+
+    What is not modelled: fading, the load of others, handover, sleep (DRX), order of the RLC layer.
+    """
+
+    slot_ms: Annotated[float, Quantity(ge=0.001)] = 0.5
+    """Length of a slot [ms]"""
+    tdd: str = "DDDSU"
+    """Pattern of the slots: D downlink, U uplink, S carries nothing. An uplink packet takes the
+    first U of a pattern, a downlink packet any D"""
+    request_ms: NotNegative = 10.0
+    """Time between two slots in which a packet of the uplink may ask for a grant [ms], a multiple
+    of the pattern; 0: a configured grant, for which nobody asks. Downlink: no effect"""
+    grant_ms: NotNegative = 2.0
+    """Time from the end of a request to the grant [ms]. Downlink: no effect"""
+    error: Annotated[float, Quantity(ge=0, le=0.99)] = 0.1
+    """Chance that a block fails, and is sent again"""
+    repeat_ms: NotNegative = 5.0
+    """Time that each repetition adds [ms]"""
+    phase_ms: Start = 0.0
+    """Time of the radio when the time line of the link is at 0 [ms], or random: drawn from seed,
+    stream, direction and episode"""
+    drift_ppm: Annotated[float, Quantity(ge=-1e5, le=1e5)] = 0.0
+    """How much faster the clock of the radio is than that of the sender [1e-6]"""
+
+    @property
+    def pattern_ns(self) -> int:
+        """Length of the pattern [ns]."""
+        return len(self.tdd) * round(self.slot_ms * 1e6)
+
+    def conflict(self) -> str:
+        """Say which keys do not agree with each other; "" if all do."""
+        if not {"D", "U"} <= {*self.tdd} <= {*"DSU"}:
+            return f"tdd: {self.tdd!r:.60}: give letters D, S and U, with at least one D and one U"
+        if round(self.request_ms * 1e6) % self.pattern_ns:
+            pattern = f"{self.pattern_ns * 1e-6:g} ms of the pattern {self.tdd}"
+            return f"request_ms: {self.request_ms:g} ms is no multiple of the {pattern}"
+        return ""
 
 
 @dataclass(frozen=True)
@@ -126,6 +170,9 @@ class DirectionKeys:
     rate_trace: str | None = None
     """File with the opportunities of a bottleneck, as mahimahi records them: a line per 1500 bytes
     that may leave, its time in ms. It takes the place of rate_kbit; netem refuses it"""
+    radio: Radio | None = field(default=None, repr=False)
+    """A radio with slots and grants, before the delay: delay_ms is the way behind it. netem refuses
+    it; null: none"""
     changes: tuple[Change, ...] = ()
     """Changes of the conditions over time; at_s must rise from entry to entry"""
     trace: str | None = None
@@ -273,6 +320,12 @@ class DirectionProfile(DirectionKeys):
             return self.opportunities[-1] if self.opportunities else None
         return round(period * 1e9)
 
+    @property
+    def phase_packets(self) -> int:
+        """Number of packets after which a simulation needs another phase of the radio."""
+        is_random = self.radio is not None and self.radio.phase_ms == RANDOM
+        return PHASE_PACKETS if is_random else 1 << 62
+
 
 def going_round(profile: DirectionProfile) -> DirectionProfile:
     """Return a direction whose time line begins again after its period, if it has one."""
@@ -382,14 +435,14 @@ def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
     return Conditions(round(delay * 1e9), jitter * 1e-3, loss, rate, blackout)
 
 
-def summary(profile: DirectionProfile) -> dict[str, float | None]:
+def summary(profile: DirectionProfile, radio: float = 0.0) -> dict[str, float | None]:
     """Summarise a direction's conditions at the start of its time line.
 
     Returns:
         `delay` and `jitter` [s]; `loss`, the long-run share in [0, 1]; and `rate` [bit/s], which is
-        None without a bottleneck.
+        None without a bottleneck. The delay includes `radio`, that in a radio [s].
     """
     first = Timeline(profile).at(0)
     loss = 1.0 if first.blackout else mean_loss(first.loss)
-    delay = round(first.delay_ns * 1e-9, 9)
+    delay = round(first.delay_ns * 1e-9 + radio, 9)
     return {"delay": delay, "jitter": first.jitter, "loss": loss, "rate": first.rate}

@@ -15,9 +15,9 @@ KIND = 131
 """Kind of the random numbers of the start."""
 
 
-def draw(seed: int, episode: int, kind: int, stream: str) -> float:
-    """Draw one number in (0, 1) for an episode of a link, of both of its directions."""
-    key = stream_key(seed, True, episode, kind, stream)
+def draw(seed: int, episode: int, kind: int, stream: str, *, uplink: bool = True) -> float:
+    """Draw one number in (0, 1) for an episode of a link; what is drawn may depend on `uplink`."""
+    key = stream_key(seed, uplink, episode, kind, stream)
     return float(uniforms_of(key, Purpose.DELAY, 0, 1)[0])
 
 

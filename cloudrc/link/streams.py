@@ -54,19 +54,22 @@ def sample(
     *,
     epoch: int = 1,
     first: int = 0,
+    turn: int = 1 << 62,
     pause: Callable[[], None] = lambda: None,
 ) -> Stream:
     """Send packets of `size` bytes through the model of a link; return their delays.
 
     `sent_ns` are the times of sending since the link came up, rising [ns]. `first` is the counter
-    of the first packet. Damaged packets count as lost, because the receiver rejects them. `pause`
-    is called every few hundred microseconds, so that other threads can run.
+    of the first packet. After `turn` packets the next epoch begins. Damaged packets count as lost,
+    because the receiver rejects them. `pause` is called every few hundred microseconds, so that
+    other threads can run.
     """
     delays, copies = np.full(len(sent_ns), np.nan), np.zeros(len(sent_ns), dtype=np.int64)
     whole = bytes(size or 1)
     for n, now_ns in enumerate(sent_ns):
-        releases = link.send(epoch, kind, first + n, size, now_ns)
-        if link.corrupts and link.corrupted(epoch, kind, first + n, whole) != whole:
+        own = epoch + n // turn
+        releases = link.send(own, kind, first + n, size, now_ns)
+        if link.corrupts and link.corrupted(own, kind, first + n, whole) != whole:
             continue
         if releases:
             delays[n], copies[n] = (min(releases) - now_ns) * 1e-9, len(releases)

@@ -24,6 +24,7 @@ from cloudrc.link.profile import (
     DirectionKeys,
     DirectionProfile,
     GilbertElliott,
+    Radio,
     Trace,
     refuse_period,
 )
@@ -80,7 +81,7 @@ def _plain(value: Any) -> Any:
     """Return a value of a profile with the plain classes in place of those of the schema."""
     if isinstance(value, tuple):
         return tuple(_plain(one) for one in value)
-    for kind in (GilbertElliott, Blackout, Change):
+    for kind in (GilbertElliott, Blackout, Change, Radio):
         if isinstance(value, kind):
             return kind(**{key.name: _plain(getattr(value, key.name)) for key in fields(kind)})
     return value

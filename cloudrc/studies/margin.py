@@ -205,7 +205,9 @@ class Margin:
     def _round_trip(self, experiment: ResolvedExperiment) -> float | None:
         """Return the round trip for a key that is a delay [ms]; None if it changes in flight."""
         ways = experiment.uplink, experiment.downlink
-        if not self.asked.key.endswith("delay_ms") or any(way.trace or way.changes for way in ways):
+        if not self.asked.key.endswith("delay_ms") or any(
+            way.trace or way.changes or way.radio for way in ways
+        ):
             return None
         return sum(way.delay_ms for way in ways)
 

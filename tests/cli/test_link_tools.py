@@ -59,3 +59,12 @@ def test_a_profile_is_drawn_and_its_statistics_printed(folder, call):
     assert 25.0 < float(lines[2].split()[1]) < 35.0
     assert lines[-1] == "a.svg"
     assert (folder / "a.svg").read_text().startswith("<?xml")
+
+
+def test_a_radio_is_shown_with_its_delays_at_random_phases(folder, call):
+    said = call("link show 5g-sa --packets 1000 -o a.svg").out
+    rows = {line[:26].strip(): line[26:].split() for line in said.splitlines()}
+    assert rows["smallest at random phases"] == ["6", "3.5", "ms"]
+    assert rows["mean at random phases"] == ["11", "4.05", "ms"]
+    assert rows["largest at random phases"] == ["16", "5", "ms"]
+    assert rows["more by repetitions, mean"] == ["0.5556", "0.5556", "ms"]

@@ -32,6 +32,7 @@ def test_every_key_is_described_and_dumped():
     optional += [
         "repeat_s",
         "rate_trace",
+        ".radio",
         "link.start_s",
         "faults",
     ]  # left out where they are empty

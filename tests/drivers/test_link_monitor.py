@@ -31,6 +31,7 @@ def test_an_honest_link_is_believed_and_never_faulted(name, netem):
     assert ("correlation" in moments[-1]) == (netem and profile.correlation > 0.0)
     assert ("rate" in moments[-1]) == (profile.rate_kbit is not None)
     assert ("time_line" in moments[-1]) == (name == "handover")
+    assert ("radio" in moments[-1]) == ("mean" not in moments[-1]) == ("-sa" in name)
 
 
 FAULTS = {

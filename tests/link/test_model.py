@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cloudrc.link.draws import BLOCK, Purpose, bad_states, normals, stream_key, uniforms
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.profile import Trace
+from cloudrc.link.profile import Radio, Trace
 from cloudrc.link.streams import Stream, loss_runs, numbers, sample
 from tests.link.profiles import blackout, change, changed, in_bursts, profile_of
 
@@ -43,6 +43,7 @@ profiles = st.builds(
     queue_packets=st.sampled_from([1, 10]),
     changes=st.sampled_from([(), (change(0.5, 0.01, 0.02, 0.1, 1e6), change(1.0, loss=0.0))]),
     blackouts=st.sampled_from([(), (blackout(0.2, 0.1),)]),
+    radio=st.sampled_from([None, None, Radio(phase_ms="random")]),
 )
 
 
@@ -283,6 +284,7 @@ def test_the_share_of_overtaken_packets_is_that_of_all_that_arrived():
         (profile_of(0.1, changes=(change(1.0, 0.05, 0.01),)), 0.04),
         (profile_of(0.1, 0.01, reorder=0.1), 0.0),
         (profile_of(0.01, 0.02), 0.0),
+        (profile_of(0.1, 0.01, radio=Radio()), 0.093),
     ],
 )
 def test_the_shortest_delay_is_that_of_the_largest_jitter(profile, shortest):

@@ -145,10 +145,13 @@ def test_a_profile_beyond_netem_is_refused_by_key(profile, key):
     assert key in str(refused.value)
 
 
-def test_only_lossy_of_the_shipped_profiles_needs_the_relay():
+def test_lossy_and_the_radios_of_the_shipped_profiles_need_the_relay():
     profiles = {name: link_profile(load_profile(name).downlink) for name in names("profile")}
     with pytest.raises(BadInputError, match="delay_bad_ms"):
         check(profiles.pop("lossy"))
+    for name in ("5g-sa", "5g-sa-configured"):
+        with pytest.raises(BadInputError, match="netem cannot do radio"):
+            check(profiles.pop(name))
     assert all(text(each, 0.0) for each in profiles.values())
 
 

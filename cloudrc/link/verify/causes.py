@@ -113,6 +113,7 @@ _BY_NUMBERS = (
     ("halved_delay", "mean", 0.45, 0.55, ": a round trip was taken for one way"),
     ("rate_ignored", "rate", 1.0, inf, ": the rate is ignored"),
     ("slow", "rate", 0.0, 1.0, ": the bottleneck is slower"),
+    ("wrong_phase", "phase", 0.0, inf, ": packets take other slots of the radio"),
     ("wrong_delay", "mean", 0.0, inf, ""),
     ("wrong_delay", "round_trip", 0.0, inf, ""),
     ("wrong_jitter", "deviation", 0.0, inf, ": the jitter differs"),

@@ -34,6 +34,8 @@ TAIL = 1e-3  # share of correct links below a band, and share above it, in [0, 1
 SAME_DELAYS, SAME_LOSSES = 0.5, 0.97
 """Limits above which a link counts as a relay with the predicted random numbers: correlation of
 measured and predicted delays; share of datagrams whose loss or arrival was predicted."""
+LAG = 3e-4  # longest time from sending a datagram to its arrival at the relay [s]
+IN_SLOTS = 0.9  # least share of probes that a radio sends in the slots of its schedule, in [0, 1]
 STILL, SHAPE_FLOOR = 1e-4, 2e-3
 """Standard deviations of the delay [s]. Below STILL, the correlation of delays is not used. Below
 SHAPE_FLOOR, the distribution is not judged, because delays of the machine itself change it."""
@@ -167,9 +169,9 @@ class Measurement:
         `epoch`, the values are exact. Otherwise each value is a range, from simulations of the link
         with different seeds. `first` is the counter of the first datagram.
         """
-        drawn = self.draw(measured.sent, epoch, first)
-        if self._fits(self._singles(measured), self._singles(drawn)):
-            return self._expect([drawn])
+        drawn = self._drawn(measured, epoch, first)
+        if any(self._fits(self._singles(measured), self._singles(each)) for each in drawn):
+            return self._expect(drawn)._replace(known=True)
         factor = sqrt(len(self.links[0].sent) / max(1, len(measured.sent)))
         bands = {
             name: (mean, mean - factor * (mean - low), mean + factor * (high - mean))
@@ -185,6 +187,33 @@ class Measurement:
         datagram in the session `epoch`.
         """
         return self._judge(measured, self.expected(measured, epoch, first))
+
+    def _drawn(self, measured: Stream, epoch: int, first: int) -> list[Stream]:
+        """Simulate what a relay does to the datagrams of a measured stream.
+
+        A radio is simulated twice: as if they reached the relay when they were sent, and `LAG`
+        later, which may be after the beginning of a slot.
+        """
+        drawn = [self.draw(measured.sent, epoch, first)]
+        if self.profile.radio:
+            later = self.draw(measured.sent + LAG, epoch, first)
+            drawn.append(replace(later, sent=measured.sent, delays=later.delays + LAG))
+        return drawn
+
+    def judge_phase(self, measured: Stream, *, late: bool) -> list[Judgement]:
+        """Judge the share of probes that a radio has sent in their slots; [] without a radio.
+
+        On a machine that is `late`, the row only tells: probes reach the relay behind their slots.
+        """
+        if self.profile.radio is None:
+            return []
+        if late or len(measured.sent) < FEWEST:
+            return [told("phase", 1.0)]
+        off = [np.abs(measured.delays - each.delays) for each in self._drawn(measured, 1, 0)]
+        least = np.minimum(*off)[np.isfinite(off[0])]
+        share = float(np.mean(least < self.profile.radio.pattern_ns * 0.5e-9))
+        verdict = "ok" if share >= IN_SLOTS else "off"
+        return [Judgement("phase", 1.0, share, IN_SLOTS, 1.0, verdict)]
 
     def judge_applied(self, applied: Stream, measured: Stream) -> list[Judgement]:
         """Judge a measured stream by what the link has computed for the same packets."""
@@ -229,7 +258,8 @@ class Measurement:
         }
         if self.train:
             measured["rate"] = self._rate(stream)
-        if len(shape) and len(pooled) and pooled.std() > SHAPE_FLOOR:
+        has_shape = not self.profile.radio  # of few different delays, which the phase judges
+        if has_shape and len(shape) and len(pooled) and pooled.std() > SHAPE_FLOOR:
             points, steps = np.sort(shape), np.arange(len(shape) + 1) / len(shape)
             left, right = (np.searchsorted(pooled, points, side) for side in ("left", "right"))
             far = steps[1:] - left / len(pooled), right / len(pooled) - steps[:-1]

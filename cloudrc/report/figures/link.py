@@ -70,7 +70,9 @@ def _draw_delay(axes: Axes, way: DirectionSample, top: float) -> None:
     delays = marks.delays_of(way.asked)
     if delays is not None and (way.asked.trace is None or way.asked.jitter_ms):
         time = np.linspace(0.0, duration, 2000)
-        low, high = marks.band(delays, time)
+        low, high = marks.band(
+            delays, time, marks.radio_span(way.asked, uplink=way.name != "downlink")
+        )
         axes.fill_between(time, low, high, color=style.LIGHT, lw=0, zorder=1, label="profile")
     _draw_blackouts(axes, way, duration)
     thin = slice(None, None, max(1, len(way.sent) // DOTS))

@@ -18,6 +18,7 @@ from cloudrc.config.faults import FaultConfig
 from cloudrc.config.profile import DirectionConfig
 from cloudrc.errors import CloudrcError
 from cloudrc.link.profile import Timeline
+from cloudrc.link.radio import schedule
 from cloudrc.link.traces import link_profile
 from cloudrc.metrics.flight import Array, rows_of, select
 from cloudrc.metrics.mission import holds
@@ -37,16 +38,27 @@ def delays_of(direction: DirectionConfig) -> Timeline | None:
         return None
 
 
-def band(delays: Timeline, time: Array) -> tuple[Array, Array]:
+def radio_span(direction: DirectionConfig, *, uplink: bool) -> tuple[float, float]:
+    """Return the shortest and longest delay in a radio, without repetitions [ms]; 0 without one."""
+    if direction.radio is None:
+        return 0.0, 0.0
+    span = schedule(direction.radio, uplink).span
+    return span.least * 1e-6, span.most * 1e-6
+
+
+def band(
+    delays: Timeline, time: Array, radio: tuple[float, float] = (0.0, 0.0)
+) -> tuple[Array, Array]:
     """Compute delay - jitter and delay + jitter [ms] at each `time` [s] since the link's start.
 
-    Both are NaN in blackouts. Uniformly distributed delays are all in this band; for other
-    distributions, its half width is one standard deviation.
+    `radio` is the shortest and longest delay in a radio, which add to them [ms]. Both are NaN in
+    blackouts. Uniformly distributed delays are all in this band; for other distributions, its half
+    width is one standard deviation.
     """
     found = [delays.at(round(instant * 1e9)) for instant in time.tolist()]
     delay = np.array([nan if each.blackout else each.delay_ns * 1e-6 for each in found])
     jitter = np.array([each.jitter * 1e3 for each in found])
-    return np.maximum(delay - jitter, 0.0), delay + jitter
+    return np.maximum(delay - jitter, 0.0) + radio[0], delay + jitter + radio[1]
 
 
 class LinkSpan(NamedTuple):
@@ -96,9 +108,11 @@ def bounds(subject: Subject, time: Array, *, uplink: bool) -> Array:
     found = parts(subject, uplink=uplink)
     newest = np.searchsorted([part.begin for part in found], time, "right") - 1
     for number in np.unique(newest):  # a drag of a slider makes many parts without a time
-        rows, delays = newest == number, delays_of(found[number].direction)
+        direction = found[number].direction
+        rows, delays = newest == number, delays_of(direction)
         if delays:
-            limits[:, rows] = band(delays, time[rows] - found[number].origin)
+            radio = radio_span(direction, uplink=uplink)
+            limits[:, rows] = band(delays, time[rows] - found[number].origin, radio)
     return limits
 
 

@@ -15,6 +15,7 @@ from cloudrc.config.profile import DIRECTIONS, DirectionConfig, Profile, load_pr
 from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Timeline, Trace
+from cloudrc.link.radio import schedule
 from cloudrc.link.streams import Numbers, Stream, numbers, sample
 from cloudrc.link.traces import link_profile, read_trace
 from cloudrc.report.figures.link import DirectionSample
@@ -118,13 +119,37 @@ STATISTICS: dict[str, tuple[str, float, Callable[[Numbers], float]]] = {
     "lost in a row, most": ("", 1.0, lambda one: max(one.runs, default=0)),
 }
 """Name of a statistic -> unit, factor from SI to this unit, and function that gives the value."""
+AT_RANDOM_PHASES = (
+    "smallest at random phases",
+    "mean at random phases",
+    "largest at random phases",
+    "more by repetitions, mean",
+)
+"""Names of the delays of packets that know nothing of the slots of a radio; the largest one is that
+of packets which are not sent again."""
 
 
-def statistics_table(counted: Mapping[str, Numbers]) -> str:
+def statistics_table(ways: Mapping[str, tuple[DirectionSample, Numbers]]) -> str:
     """Format the statistics of each direction of a link for people."""
+    counted = {way: found for way, (_, found) in ways.items()}
     rows = [["one way", *(counted if len(counted) > 1 else ("",)), ""]]
     for name, (unit, scale, value) in STATISTICS.items():
         values = [value(one) for one in counted.values()]
         cells = ["-" if isnan(number) else f"{number * scale:.4g}" for number in values]
         rows.append([name, *cells, unit])
+    if any(shown.asked.radio for shown, _ in ways.values()):
+        delays = [
+            _at_random_phases(shown.asked, uplink=way == "uplink")
+            for way, (shown, _) in ways.items()
+        ]
+        for name, row in zip(AT_RANDOM_PHASES, zip(*delays, strict=True), strict=True):
+            rows.append([name, *(f"{delay:.4g}" for delay in row), "ms"])
     return table(rows, right=range(1, len(counted) + 1))
+
+
+def _at_random_phases(asked: DirectionConfig, *, uplink: bool) -> tuple[float, ...]:
+    """Return the values of `AT_RANDOM_PHASES` for a direction without jitter [ms]."""
+    if asked.radio is None:
+        return *(asked.delay_ms,) * 3, 0.0
+    found = schedule(asked.radio, uplink)
+    return *(asked.delay_ms + each * 1e-6 for each in found.span), found.repeats_ns * 1e-6

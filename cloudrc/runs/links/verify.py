@@ -127,7 +127,9 @@ def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Measurement]) -> dic
         plan, count = plans[name], len(streams[name].sent)
         probes = f"{count} probes of {plan.flow.size} bytes"
         known = read_evidence(page, metrics, count)
-        found[name] = Findings(plan.judge(streams[name]), known, probes)
+        rows = plan.judge(streams[name])
+        rows += plan.judge_phase(streams[name], late=bool(known.starved))
+        found[name] = Findings(rows, known, probes)
     return found
 
 

@@ -2,13 +2,17 @@
 
 """Verdicts and named causes for whole links in virtual time."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from cloudrc.config.shipped import names
+from cloudrc.link.profile import DirectionProfile, Radio
 from cloudrc.link.verify import verdict_of
 from cloudrc.link.verify.causes import Findings, ShaperFacts, find_causes
-from cloudrc.link.verify.judge import look_twice
+from cloudrc.link.verify.judge import Flow, look_twice
+from cloudrc.link.verify.probe import PROBE, plan_probes
 from tests.conftest import nightly
 from tests.link.profiles import changed, profile_of
 from tests.link.verify.conftest import asked, random_profile, rows_of, verify
@@ -123,6 +127,27 @@ def test_a_fault_is_named_with_its_direction_and_by_what_the_machine_reports(
 ):
     found = find_causes(verify(PAPER, up, down, known))
     assert [(cause.code, cause.way) for cause in found] == [(code, way)]
+
+
+@pytest.mark.parametrize(
+    ("phase", "late", "verdict"),
+    [(2.1, False, "ok"), (1.95, False, "ok"), (6.0, False, "off"), (6.0, True, "told")],
+)
+def test_probes_are_in_the_slots_of_the_radio_unless_the_machine_is_late(phase, late, verdict):
+    """The relay takes the probes 0.1 ms after they are sent: at 1.95 ms behind the slot at 2 ms."""
+    radio = Radio(phase_ms=1.95 if phase == 1.95 else 2.1)
+    profile, real = (
+        DirectionProfile(radio=replace(radio, phase_ms=at)) for at in (radio.phase_ms, phase)
+    )
+    plan = plan_probes(profile, Flow(1, True, PROBE, 100))
+    relayed = replace(plan, profile=real).draw(plan.sent + 1e-4)
+    measured = replace(relayed, sent=plan.sent, delays=relayed.delays + 1.5e-4)
+    rows = plan.judge(measured)
+    (row,) = plan.judge_phase(measured, late=late)
+    assert row.verdict == verdict
+    assert (doubts(rows) == []) == (phase != 6.0)
+    (cause, *_) = find_causes({"uplink": Findings([row], ShaperFacts())}) or [None]
+    assert (cause is not None and cause.code == "wrong_phase") == (verdict == "off")
 
 
 def test_a_quantity_is_off_only_after_two_measurements():

@@ -35,6 +35,21 @@ def test_an_honest_link_is_believed_unless_the_machine_delays_it():
 
 @pytest.mark.process
 @pytest.mark.alone
+def test_a_relay_gives_packets_the_slots_that_virtual_time_gives_them():
+    keys = ["phase_ms=6", "drift_ppm=50"]
+    experiment = find_experiment("5g-sa", [f"link.uplink.radio.{key}" for key in keys])
+    with run_link(experiment, "relay") as ways:
+        found = probe_link(ways, make_plans(experiment, 3.0, "relay"))
+    codes = {cause.code for cause in find_causes(found)}
+    for rows, known, _ in found.values():
+        phase = next(row for row in rows if row.name == "phase")
+        assert (phase.verdict == "told") == bool(known.starved)
+        if "throttled" not in codes:
+            assert verdict_of(rows) == "ok"
+
+
+@pytest.mark.process
+@pytest.mark.alone
 def test_a_fault_is_named_on_the_command_line(call, monkeypatch):
     twice = [one.replace("=100", "=200").replace("=80", "=160") for one in LINK]
     wrong = find_experiment("paper-p1", twice)

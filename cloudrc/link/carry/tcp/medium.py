@@ -12,6 +12,7 @@ from dataclasses import replace
 
 from cloudrc.link.model import LinkDirection, enqueue
 from cloudrc.link.profile import Conditions, DirectionProfile, Timeline
+from cloudrc.link.radio import mean_delay
 
 SEGMENT = 1448
 """Most bytes of a segment: an IP packet of 1500 bytes, less the headers of IPv4 and TCP with time
@@ -38,7 +39,7 @@ class Medium:
         `stream` is the name of the link. Each segment has `headers` [bytes] on the wire.
         """
         self._origin_ns: int | None = origin_ns
-        self._headers = headers
+        self._headers, self._uplink = headers, uplink
         self._start_ns = 0
         self._departures = deque[int]()
         self._link = LinkDirection(profile, seed, uplink, origin_ns, stream=stream)
@@ -51,6 +52,7 @@ class Medium:
         if restart:
             self._origin_ns, self._start_ns = None, start_ns
         self._queue_packets, self._timeline = profile.queue_packets, Timeline(profile)
+        self._radio_ns = round(mean_delay(profile, self._uplink) * 1e9)
         changes = tuple(replace(change, rate_kbit=None) for change in profile.changes)
         behind = replace(profile, rate_kbit=None, changes=changes)  # what follows the bottleneck
         if profile.opportunities:  # their bottleneck stays there: a segment that waits is not lost
@@ -58,8 +60,8 @@ class Medium:
         self._link.replace_profile(behind, restart=restart, start_ns=start_ns)
 
     def delay_ns(self, now_ns: int) -> int:
-        """Return the delay of a packet without jitter [ns]."""
-        return self._at(now_ns).delay_ns
+        """Return the delay of a packet without jitter, at a mean phase of a radio [ns]."""
+        return self._at(now_ns).delay_ns + self._radio_ns
 
     def room_ns(self, now_ns: int) -> int:
         """Return when the queue of the bottleneck has room for a segment [ns]."""
