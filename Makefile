@@ -280,8 +280,9 @@ bench: $(VENV)/dev ## measure flights of all kinds beside steps; AGAINST=COMMIT:
 bench-cell: $(VENV)/all ## measure how punctual the cell of 50 robots is
 	$(bin)/python -m tools.bench_cell $(BENCH_CELL)
 
-results: $(VENV)/dev ## fly the results of docs/results.md and write them into it: minutes
+results: $(VENV)/dev ## fly the results of docs/results.md and docs/link.md, and write them there: minutes
 	$(bin)/python -m tools.results
+	$(bin)/python -m tools.radio
 
 shown: $(VENV)/dev ## compare the numbers on pages with what their commands give: 15 minutes
 	$(bin)/python -m tools.shown
