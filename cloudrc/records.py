@@ -253,6 +253,24 @@ class Control(NamedTuple):
     derivative: Annotated[Vector, "m/s", "term per axis, world frame"]
 
 
+class Left(NamedTuple):
+    """Made by cloud, if a computation takes simulated time: a command left. Topic /left."""
+
+    stamp_ns: int
+    epoch: Epoch
+    counter: Number
+
+
+class CellWait(NamedTuple):
+    """Made by the driver, in virtual time: a datagram has left the radio cell. Topic /cell_wait."""
+
+    stamp_ns: int
+    uplink: Way
+    epoch: Epoch
+    counter: Number
+    wait_ns: Annotated[int, "ns", "from its departure until the cell had sent all of it"]
+
+
 class PlanFollowed(NamedTuple):
     """Made by cloud: which position a plan had predicted for the newest odometry. Topic /plan.
 
@@ -357,7 +375,7 @@ class Lateness(NamedTuple):
 
 Record: TypeAlias = (
     (TelemetrySent | GroundTruth | ContactForce | SensorRead | Arrival | CommandApplied)
-    | EnergyUsed
+    | (EnergyUsed | Left | CellWait)
     | (GuardChange | Contact | SessionOpened | Control | PlanFollowed | MissionEvent)
     | (Fault | Counted | LinkChanged | LinkChecked | Lateness)
 )

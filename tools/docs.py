@@ -76,6 +76,11 @@ _STAMPS = {
         "/estimated_odometry /setpoint_position /cmd_vel /delay_estimate /pid",
     ("arrival of the telemetry at cloud", "once per telemetry while the robot follows a plan"):
         "/plan",
+    ("departure of the command", "once per command whose computation takes simulated time"):
+        "/left",
+    ("when the datagram has left the cell",
+     "once per command and telemetry in a cell, in virtual time"):
+        "/cell_wait",
     ("instant of the event", "once per event"): "/mission",
     ("when world or cloud notices the fault", "once per fault; repetitions are counted"): "/fault",
     ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"): "/count",

@@ -120,6 +120,20 @@ SHOWN = (
         },
     ),
     Shown(
+        "docs/timeline.md",
+        "cloudrc run paper --mode virtual --set link.profile=lte --set cloud.compute_ms=7 &&"
+        " cloudrc timeline runs/latest",
+        10.0,
+        (
+            "uplink mean 28.80 p99 47.69 ms",
+            "telemetry waits for cloud's period mean 7.05 p99 39.03 ms",
+            "cloud computes mean 7.00 p99 7.00 ms",
+            "downlink mean 19.60 p99 34.02 ms",
+            "age when it begins to act mean 63.42 p99 107.78 ms time average of the age 69.54 ms",
+            "of 2912 commands that the robot followed; the others: 9 lost, 167 superseded",
+        ),
+    ),
+    Shown(
         "docs/definitions.md",
         "cloudrc run paper-verbatim --mode virtual --report none --set link.profile=paper-p3",
         5.0,

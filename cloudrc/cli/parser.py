@@ -29,6 +29,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "ros": "show a flight to nodes of ROS 2, which may steer it",
         "replay": "watch a recorded flight in 3-D, in a browser",
         "report": "write the report of a recorded run again",
+        "timeline": "show where the age of the commands comes from, stage by stage",
         "recover": "write a clean copy of a damaged recording",
     },
     "links": {

@@ -35,7 +35,15 @@ from cloudrc.messages import (
     Setpoint,
     Telemetry,
 )
-from cloudrc.records import UNDER_WAY, Arrival, Control, Counted, MissionEvent, SessionOpened
+from cloudrc.records import (
+    UNDER_WAY,
+    Arrival,
+    Control,
+    Counted,
+    Left,
+    MissionEvent,
+    SessionOpened,
+)
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import LATE, REPEATED, USED
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
@@ -220,6 +228,8 @@ class CloudEndpoint(TunnelEnd):
         if self._unsent is not None:
             if (datagram := self._unsent[1]) is not None:
                 self._queue(datagram)
+                if (made := self._control) is not None:
+                    self._records.append(Left(now_ns, made.epoch, made.counter))
             self._unsent = None
             if now_ns < self._tick_ns:
                 return

@@ -27,6 +27,7 @@ from cloudrc.records import (
     Control,
     GroundTruth,
     Lateness,
+    Left,
     Record,
     TelemetrySent,
 )
@@ -40,7 +41,7 @@ landing after a loss of the link takes less."""
 TROUBLE = {**DISK_FULL, errno.EROFS: "disk is read-only"}
 CAPACITY = 20_000
 """Largest number of records in the queue; world or cloud makes this number in about 30 s."""
-PERIODIC = (Arrival, CommandApplied, Control, GroundTruth, Lateness, TelemetrySent)
+PERIODIC = (Arrival, CommandApplied, Control, GroundTruth, Lateness, Left, TelemetrySent)
 """Types of records that world and cloud make all the time, even between flights."""
 BATCH = 16
 """Largest number of records that the thread writes without a sleep."""

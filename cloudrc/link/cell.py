@@ -279,7 +279,12 @@ class Bulk:
 
 
 class CellQueue(PacketQueue):
-    """The packets of a robot in flight behind a cell; new ones are sent through the cell."""
+    """The packets of a robot in flight behind a cell; new ones are sent through the cell.
+
+    Attributes:
+        see: Function that gets each packet that leaves the cell: whether it is of the uplink, its
+            header (kind, epoch, counter), when it was sent and when it leaves [ns].
+    """
 
     def __init__(
         self,
@@ -298,6 +303,7 @@ class CellQueue(PacketQueue):
         self._robot, self._cells, self._orders = robot, (*cells, *cells)[:2], orders
         self._downlink, self._onward = links[1], onward or self.put
         self._last_ns, self._numbers = [0, 0], 0
+        self.see: Callable[[bool, tuple[int, int, int], int, int], None] | None = None
         for cell, link in zip(self._cells, links, strict=True):
             cell.delay_ns = min(cell.delay_ns, link.shortest_ns)
 
@@ -312,12 +318,23 @@ class CellQueue(PacketQueue):
         way = int(link is self._downlink)
         for arrival_ns in arrivals:
             self._numbers += 1
-            leave = partial(self._leave, way, link, data, arrival_ns - now_ns)
+            sent = header, now_ns
+            leave = partial(self._leave, way, link, data, arrival_ns - now_ns, sent)
             what = self._robot, self._numbers, kind, size + HEADER_BYTES, leave
             self._cells[way].inbox.append(CellPacket(now_ns, way, *what))
 
-    def _leave(self, way: int, link: LinkDirection, data: Any, delay_ns: int, now_ns: int) -> None:
-        """Take a packet that has left the cell at `now_ns` [ns]."""
+    def _leave(
+        self,
+        way: int,
+        link: LinkDirection,
+        data: Any,
+        delay_ns: int,
+        sent: tuple[tuple[int, int, int], int],
+        now_ns: int,
+    ) -> None:
+        """Take a packet that has left the cell at `now_ns` [ns]; `sent` is its header, and when."""
+        if self.see is not None:
+            self.see(way == 0, *sent, now_ns)
         arrival_ns = now_ns + delay_ns
         if self._orders[way]:
             arrival_ns = self._last_ns[way] = max(arrival_ns, self._last_ns[way])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from cloudrc import plugins
 from cloudrc.errors import describe_error
-from cloudrc.metrics import control, link, mission, response
+from cloudrc.metrics import budget, control, link, mission, response
 from cloudrc.metrics.flight import SHIPPED, Flight, Metric, add_quantities
 from cloudrc.outside import code
 from cloudrc.outside.patience import telling_if_slow
@@ -22,7 +22,7 @@ from cloudrc.record.holes import goes_on
 
 # The imported modules add the metrics of cloudrc to SHIPPED.
 add_quantities()
-__all__ = ["SHIPPED", "Flight", "Metric", "control", "link", "mission", "response"]
+__all__ = ["SHIPPED", "Flight", "Metric", "budget", "control", "link", "mission", "response"]
 
 METRIC_NOTE = "metric "
 """Beginning of a note about a metric."""
@@ -55,6 +55,7 @@ IN_SPITE_OF_HOLES = {
     "cloud_lateness_p99",
     "world_slip",
     "real_time_factor",
+    *(f"{budget.NUMBER}{stage.name}" for stage in budget.STAGES),
 }
 """Metrics of a flight with lost messages: means over the rows or steps that are left, and what the
 rest of the recording proves. All other metrics would be wrong: they compute over time, count, or

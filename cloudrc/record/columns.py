@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -108,6 +109,15 @@ class Recording(Content):
 
         return Recording(**vars(read(path, whole=whole, last_ns=last_ns)))
 
+    @staticmethod
+    def read_topics(path: Path, topics: Collection[str]) -> Recording:
+        """Read some topics of an MCAP file as `read` does, but block by block, in little memory."""
+        from cloudrc.record.reader import read
+
+        store = RecordStore()
+        content = read(path, topics=topics, take=partial(store.add_messages, str(path)))
+        return Recording(**vars(content), records=store)
+
     def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
         """Write the messages and further `attachments` to a file, atomically; may raise OSError."""
         from cloudrc.record.writer import write
@@ -164,10 +174,14 @@ class Recording(Content):
         messages = [data for name, _, data in self.messages if name == topic]
         if not messages:
             return Table(TOPICS[topic], ())
-        from cloudrc.record.reader import decode_all
+        return _decoded(TOPICS[topic], messages, self.source)
 
-        rows = decode_all(TOPICS[topic], messages, f"{self.source}: a message on {topic}")
-        return Table(TOPICS[topic], zip(*rows, strict=True))
+
+def _decoded(topic: Topic, messages: Sequence[bytes], source: str) -> Table:
+    """Decode messages of a topic, at least one, of the file `source`."""
+    from cloudrc.record.reader import decode_all
+
+    return Table(topic, decode_all(topic, messages, f"{source}: a message on {topic.name}"))
 
 
 def datagrams(table: Table | Mapping[str, Column]) -> Column:
@@ -219,6 +233,14 @@ class RecordStore:
         for kind in [kind for kind, waiting in self._waiting.items() if len(waiting) >= BLOCK]:
             self._convert(kind)
 
+    def add_messages(self, source: str, messages: Iterable[Message]) -> None:
+        """Add messages of the file `source`."""
+        by_topic = defaultdict[str, list[bytes]](list)
+        for topic, _, data in messages:
+            by_topic[topic].append(data)
+        for topic, found in by_topic.items():
+            self._blocks[topic].append(_decoded(TOPICS[topic], found, source))
+
     def _convert(self, kind: type[Record]) -> None:
         """Convert the waiting records of one class to a block for each of their topics."""
         if not (records := self._waiting.pop(kind, [])):
@@ -240,4 +262,6 @@ class RecordStore:
         if topic.end == "either" or topic.also:  # in the order of time, world's row first
             order = np.argsort(columns[0], kind="stable")
             columns = [column[order] for column in columns]
-        return Table(topic, columns)
+        whole = Table(topic, columns)
+        self._blocks[topic.name] = [whole]  # in place of the blocks, which take as much memory
+        return whole

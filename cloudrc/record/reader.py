@@ -14,7 +14,7 @@ import os
 from array import array
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from io import BufferedReader
 from itertools import pairwise
 from operator import itemgetter
@@ -29,10 +29,10 @@ from mcap.writer import MCAP0_MAGIC
 
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file
-from cloudrc.record.content import Content
+from cloudrc.record.content import Content, Message
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, of_metadata, union
-from cloudrc.record.ros import decode, is_known
-from cloudrc.record.topics import TOPICS, VIEWS, Row, Topic
+from cloudrc.record.ros import columns, decode, is_known
+from cloudrc.record.topics import TOPICS, VIEWS, Topic
 from cloudrc.record.writer import CLOCK, COUNTS, MISSING
 from cloudrc.text import list_some
 
@@ -69,9 +69,18 @@ class _WholeReads:
 class _Reader:
     """Reads the records of a file into a `Content`."""
 
-    def __init__(self, path: Path, file: IO[bytes], last_ns: int | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        file: IO[bytes],
+        last_ns: int | None = None,
+        topics: Collection[str] = TOPICS,
+        take: Callable[[list[Message]], None] | None = None,
+    ) -> None:
         self.content = Content(source=str(path))
         self._last_ns = last_ns  # only messages of the last time are kept [ns]; None: all
+        self._topics, self._take_block = topics, take
+        self._counts: Counter[str] = Counter()  # messages of the file by topic
         self._trim_at = TRIM_EVERY  # number of messages at which older ones go
         self._file = _WholeReads(file)
         self._channels: dict[int, mcap.Channel] = {}
@@ -118,7 +127,7 @@ class _Reader:
                 f"{content.source}: holds no readable message: {fault}; name another recording"
             )
         else:
-            count, until = len(content.messages), content.messages[-1][1] * 1e-9
+            count, until = self._counts.total(), content.messages[-1][1] * 1e-9
             content.unread = unread
             content.lacking = f"{fault}: {count} messages were read, the last at {until:.2f} s"
             if "damaged" in fault:
@@ -161,12 +170,21 @@ class _Reader:
         if not self._ours[number]:
             return
         if channel.topic in VIEWS:
-            self.content.views.append((channel.topic, message.log_time, message.data))
-        else:
-            self.content.messages.append((channel.topic, message.log_time, message.data))
-            self._sequences.append(message.sequence)
-            if self._last_ns is not None and len(self._sequences) >= self._trim_at:
-                self._trim(message.log_time - self._last_ns)
+            if self._take_block is None:
+                self.content.views.append((channel.topic, message.log_time, message.data))
+            return
+        self._counts[channel.topic] += 1
+        if channel.topic not in self._topics:
+            return
+        self.content.messages.append((channel.topic, message.log_time, message.data))
+        self._sequences.append(message.sequence)
+        if len(self._sequences) < self._trim_at:
+            return
+        if self._take_block is not None:
+            self._take_block(self.content.messages[:-1])
+            del self.content.messages[:-1], self._sequences[:-1]
+        elif self._last_ns is not None:
+            self._trim(message.log_time - self._last_ns)
 
     def _trim(self, first_ns: int) -> None:
         """Remove the messages before a log time [ns]: memory then holds twice the kept ones."""
@@ -211,19 +229,24 @@ class _Reader:
         if metadata.get(COUNTS) == "" and MISSING not in metadata:
             yield "it was torn, and another program added an end"
         if self._last_ns is None and (stored := metadata.get(COUNTS)):
-            counts, read = (
-                Counter(json.loads(stored)),
-                Counter(each[0] for each in content.messages),
-            )
+            counts, read = Counter(json.loads(stored)), self._counts
             wrong = [f"{read[t]} of {counts[t]} on {t}" for t in TOPICS if read[t] != counts[t]]
             if wrong:
                 yield f"messages were removed or added: it holds {list_some(wrong)}"
 
 
-def read(path: Path, *, whole: bool = False, last_ns: int | None = None) -> Content:
+def read(
+    path: Path,
+    *,
+    whole: bool = False,
+    last_ns: int | None = None,
+    topics: Collection[str] = TOPICS,
+    take: Callable[[list[Message]], None] | None = None,
+) -> Content:
     """Read an MCAP file up to its end or to its first damage.
 
-    With `last_ns`, keep the messages of the last time [ns] at least, in little memory.
+    With `last_ns`, keep the messages of the last time [ns] at least, in little memory. With `take`,
+    which gets the messages of the `topics` block by block, keep none.
 
     Raises:
         BadInputError: If the file cannot be read or is not MCAP; with `whole`, also if it is torn,
@@ -246,16 +269,24 @@ def read(path: Path, *, whole: bool = False, last_ns: int | None = None) -> Cont
             text = next(known, "is not an MCAP file; name a recording (.mcap)")
             raise BadInputError(f"{path}: {text}")
         file.seek(0)
-        content = _Reader(path, file, last_ns).read()
+        content = _Reader(path, file, last_ns, topics, take).read()
+    if take is not None:
+        take(content.messages)
+        content.messages = []
     if whole and content.lacking:
         copy = f"to copy what is readable: cloudrc recover {quote(str(path))}"
         raise BadInputError(f"{path}: {content.lacking}; {copy}")
     return content
 
 
-def decode_all(topic: Topic, messages: Iterable[bytes], what: str) -> list[Row]:
-    """Decode messages of a topic; `what` begins the text of the error about an unreadable one."""
+def decode_all(topic: Topic, messages: Sequence[bytes], what: str) -> Iterable[Any]:
+    """Decode messages of a topic, at least one: the columns of their stamps and of their fields.
+
+    `what` begins the text of the error about an unreadable message.
+    """
     try:
-        return [decode(topic, data) for data in messages]
+        if (found := columns(topic, messages)) is not None:
+            return found
+        return zip(*[decode(topic, data) for data in messages], strict=True)
     except Exception as error:  # rosbags may raise anything on malformed bytes
         raise BadInputError(f"{what} is not readable; use the original file") from error

@@ -20,6 +20,7 @@ from operator import attrgetter
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
@@ -141,6 +142,21 @@ def decode(topic: Topic, data: bytes) -> Row:
     return stamp_of(message), *_PARSE[topic.name](message)
 
 
+def columns(topic: Topic, messages: Sequence[bytes]) -> list[NDArray[Any]] | None:
+    """Decode messages of a topic at once: a column of stamps [ns], and one for each field.
+
+    Return None unless all have the layout that cloudrc writes, with numbers alone.
+    """
+    layout = _BLOCKS[topic.name]
+    if layout is None or any(len(data) != layout.itemsize for data in messages):
+        return None
+    rows = np.frombuffer(b"".join(messages), layout)
+    if (rows["code"] != _LITTLE).any() or (rows["frame"] != _FRAME).any():
+        return None
+    stamps_ns = rows["sec"].astype(np.int64) * _SECOND_NS + rows["nanosec"]
+    return [stamps_ns, *(rows[field.name].copy() for field in topic.fields)]
+
+
 def stamp_of(message: Any) -> int:
     """Return the stamp in the header of a message [ns]."""
     stamp = message.header.stamp
@@ -257,6 +273,30 @@ def _layout(kinds: Iterable[Kind]) -> str:
     return layout
 
 
+_LITTLE, _FRAME = b"\0\1", b"\6\0\0\0world"
+"""Begin of a little-endian message, and the frame in its header, without their final zeros."""
+_FORMS: dict[Kind, Any] = {"int": "<i8", "float": "<f8", "bool": "?", "vector": ("<f8", 3)}
+"""Kind of a value in a message without texts -> its type in numpy."""
+
+
+def _block(topic: Topic) -> np.dtype[Any] | None:
+    """Return the layout of a topic's messages as numpy has it; None if they have texts."""
+    kinds = [field.kind for field in topic.fields]
+    if not topic.ros_type.startswith(_OURS) or not {*kinds} <= _FORMS.keys():
+        return None
+    parts = [("code", "S4", 0), ("sec", "<i4", 4), ("nanosec", "<u4", 8), ("frame", "S10", 12)]
+    for count, field in enumerate(topic.fields, start=1):
+        end, size = (
+            struct.calcsize(each) for each in (_layout(kinds[:count]), f"<{_CODES[field.kind]}")
+        )
+        parts.append((field.name, _FORMS[field.kind], end - size))
+    names, formats, offsets = zip(*parts, strict=True)
+    whole: dict[str, Any] = {"names": names, "formats": formats, "offsets": offsets}
+    whole["itemsize"] = struct.calcsize(_layout(kinds))
+    layout: np.dtype[Any] = np.dtype(whole)  # type: ignore[call-overload]
+    return layout
+
+
 def _numbers(kinds: Iterable[Kind], values: Values) -> list[Any]:
     """List the numbers of a row's values, those of a vector one by one."""
     found: list[Any] = []
@@ -270,6 +310,7 @@ def _numbers(kinds: Iterable[Kind], values: Values) -> list[Any]:
 
 _PACKERS = {name: _packer(topic) for name, topic in TOPICS.items()}
 _PARSE = {name: _parser(topic) for name, topic in TOPICS.items()}
+_BLOCKS = {name: _block(topic) for name, topic in TOPICS.items()}
 
 # What the writing thread needs is made on import: rosbags takes milliseconds for each type, and in
 # flight the thread would block the loop for that time.

@@ -161,6 +161,10 @@ _TABLE = (
     Topic("/plan", "cloudrc_msgs/msg/PlanFollowed", rec.PlanFollowed, "cloud",
         "With plans: the position that the plan in use had predicted for the newest odometry,"
         " cloud's clock"),
+    Topic("/left", "cloudrc_msgs/msg/Left", rec.Left, "cloud",
+        "A command left cloud, cloud's clock. Only if a computation takes simulated time"),
+    Topic("/cell_wait", "cloudrc_msgs/msg/CellWait", rec.CellWait, "world",
+        "A datagram left the radio cell, world's clock. Only in virtual time, with a cell"),
     Topic("/mission", "cloudrc_msgs/msg/MissionEvent", rec.MissionEvent, "cloud",
         "An event of the mission, cloud's clock"),
     Topic("/fault", "cloudrc_msgs/msg/Fault", rec.Fault, "either",
@@ -183,7 +187,7 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 
 ADDED = ("/plan", "/sensor")
 """Topics that came later than the others; without rows they do not change a hash."""
-UNHASHED = ("/energy",)
+UNHASHED = ("/energy", "/left", "/cell_wait")
 """Topics that never change a hash: flights from before them keep theirs."""
 
 VIEWS: dict[str, str] = {

@@ -85,7 +85,7 @@ def world_records(count, start_ns=0):
                 rec.CommandApplied(now + 4 * MS, 1, n - 3, now - 60 * MS, velocity),
             ]
     records += [rec.Contact(now, "board", ZERO, ZERO, ZERO, True)]
-    records += [rec.Counted(now, "world", "sent", count)]
+    records += [rec.Counted(now, "world", "sent", count), rec.CellWait(now, True, 1, 0, MS)]
     return sorted(records, key=attrgetter("stamp_ns"))
 
 
@@ -102,6 +102,7 @@ def cloud_records(count, start_ns=0):
         ]
     records.append(rec.MissionEvent(period, "done", 2, "mission done — ça va"))
     records += [rec.Fault(period, "late", ""), rec.Counted(period, "cloud", "", 3)]
+    records.append(rec.Left(period, 1, count - 1))
     return sorted(records, key=attrgetter("stamp_ns"))
 
 

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Flights of some seconds in virtual time, and recordings of their ends."""
+
+from functools import cache
+
+from cloudrc import assembly
+from cloudrc.config.load import load_experiment
+from cloudrc.record.merge import merge
+from cloudrc.record.writer import McapWriter
+from cloudrc.timeline.read import read_flight
+
+MS = 1_000_000
+CONSTANT = ("link.profile=ideal", "link.uplink.delay_ms=33", "link.downlink.delay_ms=21")
+SETTINGS = {
+    "constant": CONSTANT,
+    "reordered": ("link.profile=paper-p3",),
+    "in order of arrival": ("link.profile=paper-p3", "tunnel.order=arrival"),
+    "blackouts": ("link.profile=handover",),
+    "computes": ("link.profile=lte", "cloud.compute_ms=7"),
+    "plans": ("link.profile=wifi", "cloud.plan_s=0.3", "cloud.predictor=model_based"),
+}
+
+
+@cache
+def records(*settings):
+    """Fly for 8 s; return the records of world and of cloud."""
+    experiment = load_experiment("hover", settings)
+    _, _, teleop, run = assembly.assemble(experiment)
+    found = [], []
+
+    def sink(*new):
+        for records, more in zip(found, new, strict=True):
+            records += more
+
+    run.fly(lambda: teleop.over, 8000 * MS, sink)
+    return found
+
+
+def write(path, records, clock, clock_id="one"):
+    """Write the file of an end."""
+    with McapWriter(path, clock=clock, clock_id=clock_id) as writer:
+        writer.write(records)
+    return path
+
+
+def flight_of(folder, *settings, ahead_ns=0):
+    """Return a recorded flight; cloud's clock is ahead of world's."""
+    world, cloud = records(*settings)
+    write(folder / "world.mcap", world, "world")
+    later = [each._replace(stamp_ns=each.stamp_ns + ahead_ns) for each in cloud]
+    write(folder / "cloud.mcap", later, "cloud", "another" if ahead_ns else "one")
+    merge(folder / "world.mcap", folder / "cloud.mcap").write(folder / "mission.mcap")
+    return read_flight(folder)
