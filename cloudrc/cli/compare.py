@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from cloudrc.cli.output import TABLES, output_argument, print_result, tell, warn_about
 from cloudrc.cli.parser import Options, Parser, read_count, set_argument
 from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.outside.refusal import naming
 from cloudrc.text import csv_table, latex_table
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ EPILOG = """\
 A and B are one of:
   settings           KEY=VALUE[,KEY=VALUE...]: fly both with each seed
   values of an axis  of the finished sweep in --in DIR
+  runs               with --budget: their folders, or MCAP files
 
 examples:
   cloudrc compare cloud.predictor=constant_velocity \\
@@ -27,6 +29,7 @@ examples:
     cloud.predictor=constant_velocity,cloud.estimator=split --number iae_mean
   cloudrc compare cloud.estimator=running_mean cloud.estimator=split \\
     --set link.profile=handover --number delay_estimate_error_rms
+  cloudrc compare runs/before runs/after --budget
   cloudrc compare constant_velocity constant_acceleration --in runs/sweep-grid-1"""
 
 
@@ -45,6 +48,11 @@ def arguments(parser: Parser) -> None:
     parser.add_argument(
         "--cost", action="store_true", help=f"{about} to that flight, {where}, and the bytes"
     )
+    about = (
+        "compare the stages of the age of the commands: which one did the change move? A and B may"
+        " be two runs"
+    )
+    parser.add_argument("--budget", action="store_true", help=about)
     output_argument(parser, forms=TABLES)
 
 
@@ -62,10 +70,13 @@ def flight_arguments(parser: Parser, seeds: int) -> None:
 def execute(options: Options) -> int:
     """Compare A and B, print the result, and return the exit code: 0 if all flights were flown."""
     from cloudrc.cli.progress import Progress
-    from cloudrc.studies.compare import compare, of_sweep
+    from cloudrc.studies.compare import budget_numbers, compare, of_sweep
     from cloudrc.studies.compare_text import as_text, cells
 
     stopped = None
+    if options.budget and not options.sweep and "=" not in options.a + options.b:
+        _compare_runs(options)
+        return 0
     if options.set and options.sweep:
         raise BadInputError(f"--set {options.set[0]}: these flights are finished; leave it out")
     if options.cost and options.sweep:
@@ -82,7 +93,8 @@ def execute(options: Options) -> int:
         if not found.pairs:
             return stopped.exit_code
     with Progress(f"compares {len(found.pairs):,} pairs of flights"):
-        compared = compare(found.pairs, found.units, options.number)
+        names = budget_numbers(found.pairs) if options.budget else options.number
+        compared = compare(found.pairs, found.units, names)
     document = {
         **{"a": options.a, "b": options.b, "of": found.what},
         **{"overrides": options.set, "interrupted": bool(stopped)},
@@ -96,6 +108,27 @@ def execute(options: Options) -> int:
     tables = {"csv": csv_table(rows), "latex": latex_table(cells(document))}
     print_result(options.output, document, as_text(document), **tables)
     return stopped.exit_code if stopped else 0
+
+
+def _compare_runs(options: Options) -> None:
+    """Print the budgets of two runs side by side."""
+    from cloudrc.cli.progress import Progress
+    from cloudrc.text import table
+    from cloudrc.timeline.read import read_loops
+    from cloudrc.timeline.text import side_by_side
+
+    budgets = []
+    for run in (options.a, options.b):
+        with Progress(f"reads the recording of {run}"):
+            loops = read_loops(Path(run))
+            budgets.append({name: loop.document for name, loop in loops.items()})
+    with naming("--budget"):
+        rows = side_by_side(*budgets)
+    cells = [tuple(rows[0]), *(tuple(row.values()) for row in rows)]
+    document = {"a": options.a, "b": options.b, "budgets": budgets}
+    text = "\n".join([f"A: {options.a}", f"B: {options.b}", "", table(cells, right=range(1, 6))])
+    tables = {"csv": csv_table(rows), "latex": latex_table(cells)}
+    print_result(options.output, document, text, **tables)
 
 
 def _fly_both(options: Options) -> tuple[Pairs, CloudrcError | None]:

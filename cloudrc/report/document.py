@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
 from cloudrc.config.time_line import link_start
+from cloudrc.metrics.budget import budget_of
 from cloudrc.metrics.flight import Flight
 from cloudrc.metrics.measure import Number
 from cloudrc.metrics.response import steps
@@ -97,6 +98,7 @@ class Assessment:
                 "shaper": self.run.shaper,
                 "records_sha256": self.records_sha256,
                 "numbers": values,
+                "budget": budget_of(self.flight).document,
                 "steps": [_known(step._asdict()) for step in steps(self.flight)]
                 if self.experiment.mission.steps
                 else None,

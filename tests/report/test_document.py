@@ -14,7 +14,7 @@ from tests.metrics.conftest import paper
 RUN = Run("virtual", "virtual")
 NAMES = set(
     "schemaVersion verdict failures experiment mode seed shaper config_sha256 records_sha256 "
-    "numbers complete notes link_start".split()
+    "numbers budget complete notes link_start".split()
 )
 
 

@@ -16,12 +16,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cloudrc.record import wall_time
-from cloudrc.report.figures import curves, flight, marks, still, tails
+from cloudrc.report.figures import budget, curves, flight, marks, still, tails
 from cloudrc.report.figures.style import Look, Subject
 
 FIGURES: dict[str, tuple[Callable[[Subject], Figure], str, str]] = {
     "flight": (flight.draw, flight.CAPTION, flight.ALT),
     "delay": (curves.draw_delay, curves.DELAY, curves.DELAY_ALT),
+    "budget": (budget.draw, budget.CAPTION, budget.ALT),
     "odom": (curves.draw_odom, curves.ODOM, curves.ODOM_ALT),
     "error": (curves.draw_error, curves.ERROR, curves.ERROR_ALT),
     "age": (tails.draw_age, tails.AGE, tails.AGE_ALT),
