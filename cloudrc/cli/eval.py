@@ -62,6 +62,11 @@ def arguments(parser: Parser) -> None:
     parser.add_argument("--rows", type=Path, metavar="FILE", help=about)
     about = "folder of another policy's evaluation, to compare with in pairs"
     parser.add_argument("--versus", type=Path, metavar="DIR", help=about)
+    about = (
+        "keep a file per episode that is played, in the folder timelines; read it with"
+        " 'cloudrc timeline'"
+    )
+    parser.add_argument("--keep", choices=("timeline",), help=about)
     output_argument(parser, forms=TABLES)
 
 
@@ -145,9 +150,8 @@ def execute(options: Options) -> int:
         with Progress("plays episodes", len(episodes)) as view:
             view.say(f"{setup.env}: {len(episodes)} episodes, {setup.facts}")
             try:
-                rows, stopped = results.play_missing(
-                    folder, setup, episodes, options.jobs, known, view.count
-                )
+                asked = folder, setup, episodes, options.jobs, known, view.count
+                rows, stopped = results.play_missing(*asked, keep=bool(options.keep))
             except CloudrcError:
                 tell(f"what was played is kept; the same call with --out {folder} goes on")
                 raise

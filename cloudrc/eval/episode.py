@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import cache
 from hashlib import sha256
 from math import isfinite
+from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -27,7 +28,9 @@ from cloudrc.drivers.openpi.actions import PolicyAnswerError, read_actions
 from cloudrc.errors import CloudrcError
 from cloudrc.eval.environment import environment_code, find_module
 from cloudrc.eval.setup import BARE, SEED, Episode, EvalSetup, link_at
+from cloudrc.files import write_json
 from cloudrc.gym import Networked
+from cloudrc.gym.answers import to_document
 from cloudrc.gym.options import ANSWER
 from cloudrc.gym.step import find_step
 from cloudrc.gym.values import leaves, size_of
@@ -90,14 +93,21 @@ def _one(given: Any) -> Any:
     return given.reshape(())[()] if isinstance(given, np.ndarray) and given.size == 1 else given
 
 
-def play(episode: Episode, setup: EvalSetup, key: str = "") -> dict[str, Any]:
-    """Play an episode; return its row. Raise a CloudrcError if policy or environment fail."""
+def play(
+    episode: Episode, setup: EvalSetup, key: str = "", keep: Path | None = None
+) -> dict[str, Any]:
+    """Play an episode; return its row. Raise a CloudrcError if policy or environment fail.
+
+    With `keep`, write into this file when each answer was asked for, made and executed.
+    """
     played = episode
     if episode.is_baseline:
         setup, played = replace(setup, **BARE), Episode(episode.rtt_ms, "newest", episode.seed)
     with make_env(setup, episode.seed) as env, asking(setup) as ask:
         ended, success, digest, numbers, loop = _play(played, setup, env, ask)
     numbers |= _numbers_of(loop)
+    if keep:
+        write_json(keep, to_document(loop["timeline"]))
     judged = {None: "done", True: "success", False: "failure"}
     return {
         "key": key,
@@ -122,6 +132,7 @@ def _numbers_of(loop: Mapping[str, Any]) -> dict[str, float]:
     for name in ("observation_age", "action_age"):
         found |= {name + end: loop[name + key] for end, key in AGE_NUMBERS.items()}
     found |= {name: loop[name] for name in ("late_share", "misses_in_10")}
+    found |= {name: value for name, value in loop.items() if name.startswith("budget_")}
     for way in ("uplink", "downlink"):
         found |= {f"{name}_{way}": loop[way][name] for name in ("delay_asked", "delay_measured")}
         found[f"loss_{way}"] = loop[way]["loss_measured"]
@@ -279,7 +290,7 @@ def _play(
         "stale_share": stale / steps,
         "seam_jump": fmean(jumps) if jumps else None,
     }
-    loop = {**world.summary(), "doubts": doubts}
+    loop = {**world.summary(), "doubts": doubts, "timeline": world.timeline()}
     return ended, success, witness.digest.hexdigest(), numbers, loop
 
 

@@ -88,6 +88,8 @@ TESTS = {
 """Head -> cell of the table of tests."""
 
 
+TIMES = ("age", "delay", "budget")
+"""Words in the names of numbers that are times."""
 FLAT = ("seed", "verdict", "ended", "link_start", "records_sha256", "code")
 """Fields of a row that a flat line has beside its condition and its numbers."""
 
@@ -142,10 +144,11 @@ class EpisodeTrial(NamedTuple):
     key: str
     episode: Episode
     setup: EvalSetup
+    keep: Path | None = None  # file for its timeline; None: none
 
     def play(self) -> Row:
         """Play it; return its row."""
-        return play(self.episode, self.setup, self.key)
+        return play(self.episode, self.setup, self.key, self.keep)
 
 
 def play_missing(
@@ -155,19 +158,28 @@ def play_missing(
     jobs: int,
     known: Before,
     see: Callable[[int], None],
+    *,
+    keep: bool = False,
 ) -> tuple[list[Row], CloudrcError | None]:
     """Play the episodes without a row in `folder`; return the rows of all, and why it ended early.
 
     `see` gets the number of episodes that have a row, at the beginning and after each one. The
-    file of the folder gets what is `known`.
+    file of the folder gets what is `known`. With `keep`, each episode that is played leaves a file
+    in the folder's `timelines`.
 
     Raises:
         CloudrcError: If environment or policy fail; the rows before are kept.
     """
     rows, identity = Rows(folder), setup.identity()
+    timelines = folder / "timelines" if keep else None
+    if timelines:
+        timelines.mkdir(exist_ok=True)
     write(folder, setup, known._asdict())
     with reuse_results():  # the code of an executor is that of all its episodes
-        trials = [EpisodeTrial(each.key(identity), each, setup) for each in episodes]
+        trials = [
+            EpisodeTrial(each.key(identity), each, setup, timelines and timelines / each.file)
+            for each in episodes
+        ]
     done = count(sum(each.key in rows.kept for each in trials))
     see(next(done))
     # A server may serve one episode at a time.
@@ -201,7 +213,7 @@ def write(folder: Path, setup: EvalSetup, found: Mapping[str, Any]) -> dict[str,
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
     """Write a flat line per episode into a CSV or Parquet file; times are in s."""
     columns = columns_of(rows, ("rtt_ms", "executor"), FLAT)
-    times = [name for name in columns if "age" in name or "delay" in name]
+    times = [name for name in columns if any(word in name for word in TIMES)]
     units = {name: "s" for name in (*times, "link_start") if not name.endswith("_of")}
     write_table(path, columns, units)
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
@@ -148,6 +149,13 @@ class Episode:
         """The condition without its seed."""
         given = [f"{key}={value}" for key, value in self.parameters]
         return {"rtt_ms": self.rtt_ms, "executor": " ".join([self.executor, *given])}
+
+    @property
+    def file(self) -> str:
+        """Name of a file about it alone."""
+        name = re.sub(r"[^\w.=]+", "-", self.point["executor"])
+        rtt = "" if self.rtt_ms is None else f"-{self.rtt_ms:g}ms"
+        return f"{name}{rtt}-seed{self.seed}.json"
 
     @property
     def chosen(self) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from gymnasium.error import ResetNeeded
 
+from cloudrc.gym.answers import ARRIVED, BEGUN, LEFT, RECEIVED, Answers, Instants
 from cloudrc.gym.asked import Met, asked_of, expected
 from cloudrc.gym.doubts import doubts
 from cloudrc.gym.executors import Chunk, Committed, Executor
@@ -93,6 +94,7 @@ class RemoteLoop:
             of a tick [s]; at first, it is that of the settings.
         start: What the robot executes without any answer.
         memory: What the policy remembers beside this observation.
+        answers: When each answer of the episode was asked for, made and executed.
         judge_link: Function that warns of a link that nobody knew before, and says whether it did.
     """
 
@@ -158,6 +160,10 @@ class RemoteLoop:
         self._action_ages, self._loop_ages = list[float](), list[int]()
         self._fresh_ages = list[float]()  # of new actions since the first of _action_ages, else NaN
         self._executor.basis = -1
+        self.answers = Answers()
+        self.answers.ask(0, 0)
+        self.answers.note(0, ARRIVED, 0)
+        self.answers.note(0, BEGUN, 0)
         self.memory.begin()
         late = self._ticks_late((self._up.wire, self._down.wire))
         self._executor.begin(late, round(self._settings.dt * 1e9))
@@ -225,6 +231,7 @@ class RemoteLoop:
                 self._judge(action)
                 Quantity(ge=0, le=tick).of(executor.basis, "basis")
             self._last, self._basis = action, executor.basis
+            self.answers.execute(executor.basis, self._now_ns)
         else:
             self._held += 1
             if not self._settings.repeats:
@@ -240,8 +247,11 @@ class RemoteLoop:
         chunk = Chunk(self._seen_tick, actions)
         if self._settings.waits and not self._tick:
             self._executor.receive(chunk, 0)  # the episode begins when this answer has arrived
+            self.answers.note(0, LEFT, 0)
+            self.answers.note(0, RECEIVED, 0)
             return
         self._free_ns = self._begin_ns + self._time_to_compute()
+        self.answers.note(self._seen_tick, LEFT, self._free_ns)
         self._down.send(self._seen_tick, self._free_ns, chunk)
 
     def _receive(self, limit_ns: int) -> None:
@@ -250,7 +260,8 @@ class RemoteLoop:
             self._down.run(limit_ns)
         queue = self._down.queue
         while queue.next_ns <= limit_ns:
-            _, _, chunk = queue.pop()
+            at_ns, _, chunk = queue.pop()
+            self.answers.note(chunk.basis, RECEIVED, at_ns)
             if chunk.basis:
                 self._loop_ages.append(self._tick - chunk.basis)
             self._executor.receive(chunk, self._tick)
@@ -265,6 +276,7 @@ class RemoteLoop:
             message = (tick, committed, copied(observation), dict(info))
             more = size_of(committed.actions) if committed.actions else 0
             self._up.send(tick, now_ns, message, more)
+            self.answers.ask(tick, now_ns)
         self._ask(now_ns + self._within_ns)
         if self._seen_tick:
             self._observation_ages.append(tick - self._seen_tick)
@@ -277,12 +289,14 @@ class RemoteLoop:
         while (begin_ns := max(queue.next_ns, self._free_ns)) <= limit_ns:
             before = self._seen_tick
             while queue.next_ns <= begin_ns:
-                _, _, message = queue.pop()
+                at_ns, _, message = queue.pop()
+                self.answers.note(message[0], ARRIVED, at_ns)
                 if message[0] > self._seen_tick:
                     self._seen_tick, self._committed, *self.seen = message
             if self._seen_tick > before:
                 self.is_asked, self._begin_ns = True, begin_ns
                 self._free_ns = begin_ns + self._time_to_compute()
+                self.answers.note(self._seen_tick, BEGUN, begin_ns)
 
     def _time_to_compute(self) -> int:
         """Return how long the policy computes the answer to its newest observation [ns]."""
@@ -318,6 +332,12 @@ class RemoteLoop:
             found["prefix"], found["delay"] = self._committed
         return found
 
+    def timeline(self) -> dict[str, Instants]:
+        """Return when each answer of this episode was asked for, made and executed [ns]."""
+        if self._tick < 0:
+            raise ResetNeeded("call reset() before timeline()")
+        return self.answers.table()
+
     def summary(self) -> dict[str, Any]:
         """Return what the loop was like in this episode: asked and measured.
 
@@ -348,6 +368,7 @@ class RemoteLoop:
             "late_share": late,
             "misses_in_10": most_missed(~is_new) if len(is_new) else nan,
             "held_share": self._held / ticks if ticks else nan,
+            **self.answers.means(),
             "uplink": self._up.summary(asked_of(self._up.wire, dt, met)),
             "downlink": self._down.summary(asked_of(self._down.wire, dt, met)),
         }

@@ -10,6 +10,7 @@ from typing import Any, Unpack
 import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import NDArray
 
 from cloudrc.gym.links import Links
 from cloudrc.gym.options import (
@@ -118,6 +119,16 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Raise gymnasium's ResetNeeded before the first `reset`.
         """
         return self._loop.summary()
+
+    def timeline(self) -> dict[str, NDArray[np.int64]]:
+        """Return the instants of each answer of the last episode [ns], each of shape (n,).
+
+        They are those of `cloudrc.gym.answers.CUTS`, beside the `tick` of the observation; -1
+        stands for what never happened: lost, dropped for a newer one, or still under way. What is
+        between two of them is a stage of the age. Raise gymnasium's ResetNeeded before the first
+        `reset`.
+        """
+        return self._loop.timeline()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -126,7 +126,7 @@ def test_a_file_for_rows_that_cannot_be_written_is_refused_before(
 
 
 def test_the_line_to_continue_fits_the_call(law, tmp_path, evaluate, monkeypatch):
-    def interrupted(folder, *_):
+    def interrupted(folder, *_, keep):
         return [], InterruptedRunError("interrupted")
 
     monkeypatch.setattr("cloudrc.eval.results.play_missing", interrupted)
