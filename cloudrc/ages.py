@@ -63,7 +63,10 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
     size = TELEMETRY_SIZES[len(known_robot(world.robot).sensors)]
     up = _cross(experiment, Kind.TELEMETRY, size, measured_ns, measured_ns, newest_wins)
     heard_ns = up.at_ns.min(initial=DURATION_NS)
-    begun_ns, sent_ns = _commands(experiment, grid_ns[grid_ns >= heard_ns])
+    if cloud.answers == "arrival":
+        begun_ns, sent_ns = _answers(experiment, up)
+    else:
+        begun_ns, sent_ns = _commands(experiment, grid_ns[grid_ns >= heard_ns])
     down = _cross(experiment, Kind.COMMAND, COMMAND_SIZES[plan], begun_ns, sent_ns, newest_wins)
     times_ns = np.unique(np.concatenate([*grids_ns, sent_ns, up.at_ns, down.at_ns]))
     times_ns = times_ns[1 : times_ns.searchsorted(DURATION_NS) + 1]
@@ -90,6 +93,21 @@ def _commands(experiment: ResolvedExperiment, grid_ns: Array) -> tuple[Array, Ar
         sent_ns.append(begin_ns + compute.end(begin_ns))
         begin_ns = max(sent_ns[-1], (begin_ns // period_ns + 1) * period_ns)
     return np.array(begun_ns), np.array(sent_ns)
+
+
+def _answers(experiment: ResolvedExperiment, up: _Arrivals) -> tuple[Array, Array]:
+    """Return when cloud begins each command if it answers newer telemetry, and when it sends it."""
+    compute = build_compute_time(experiment)
+    period_ns = round(1e9 / experiment.cloud.command_rate_hz)
+    news_ns = np.append(up.at_ns[np.diff(up.newest, prepend=-1) > 0], DURATION_NS)
+    begun_ns, sent_ns, begin_ns = list[int](), list[int](), int(news_ns[0])
+    while begin_ns < DURATION_NS:
+        begun_ns.append(begin_ns)
+        sent_ns.append(begin_ns + (compute.end(begin_ns) if compute else 0))
+        next_ns = int(news_ns[news_ns.searchsorted(begin_ns, "right")])
+        due_ns = min(max(next_ns, begin_ns + period_ns // 2), begin_ns + 3 * period_ns // 2)
+        begin_ns = max(due_ns, sent_ns[-1])
+    return np.array(begun_ns, np.int64), np.array(sent_ns, np.int64)
 
 
 def _cross(

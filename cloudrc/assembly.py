@@ -292,7 +292,11 @@ def build_cloud(
         compute = build_compute_time(experiment, cpu_clock if cloud.compute_measured else None)
     newest_wins = experiment.tunnel.order == "newest"
     return CloudEndpoint(
-        loop, teleop, identity, newest_wins=newest_wins, compute=compute, start_ns=clock()
+        *(loop, teleop, identity),
+        newest_wins=newest_wins,
+        compute=compute,
+        start_ns=clock(),
+        on_arrival=cloud.answers == "arrival",
     )
 
 

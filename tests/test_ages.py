@@ -33,6 +33,8 @@ def test_computing_delays_commands_and_a_blackout_does_not_count():
     [
         ("cloud.compute_ms=160",),
         ("cloud.compute_ms=14", "cloud.command_rate_hz=50"),
+        (*both_ways(delay_ms=43), "cloud.answers=arrival"),
+        (*both_ways(delay_ms=43), "cloud.answers=arrival", "cloud.compute_ms=14"),
         (*both_ways(delay_ms=40), "cloud.compute_ms=64", "world.odometry_rate_hz=50"),
         ("cloud.compute_ms=100", "cloud.compute_deviation_ms=60"),
     ],

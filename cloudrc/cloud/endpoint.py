@@ -74,6 +74,9 @@ QUOTA_PERIOD_NS = 100_000_000
 Source: Linux, Documentation/scheduler/sched-bwc.rst; Kubernetes, default of cpuCFSQuotaPeriod."""
 COUNT_PERIOD_NS = 1_000_000_000
 """Time between two records of the counters [ns]."""
+SILENT_PERIODS = 3
+"""With answers on arrival, cloud sends a command after so many half periods without newer
+telemetry: the guard needs 10 in 500 ms to leave HOLD."""
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
@@ -166,6 +169,7 @@ class CloudEndpoint(TunnelEnd):
         newest_wins: bool,
         compute: ComputeTime | None = None,
         start_ns: int = 0,
+        on_arrival: bool = False,
     ) -> None:
         """Connect the parts; there is no session yet.
 
@@ -176,6 +180,7 @@ class CloudEndpoint(TunnelEnd):
             newest_wins: Whether to drop telemetry that arrives after newer telemetry.
             compute: The simulated time between computation and departure of a command; None: 0.
             start_ns: The present time on cloud's monotonic clock [ns].
+            on_arrival: Whether newer telemetry, and not a period, makes a command due.
         """
         super().__init__(identity, Direction.DOWNLINK, loop.counts, newest_wins=newest_wins)
         self._loop, self.teleop = loop, teleop
@@ -195,6 +200,7 @@ class CloudEndpoint(TunnelEnd):
         self._asked = 0  # highest number of an operator request in this session
         self._start: tuple[int, int] | None = None  # number and time [ns] of the newest START
         self._tick_ns = start_ns
+        self._on_arrival, self._due_ns = on_arrival, start_ns  # when a command is due, if so [ns]
         self._hello_ns = start_ns - KEY_PERIOD_NS  # time of the last periodic hello
         self._alive_ns = start_ns  # time of the next ALIVE while there are no commands
         self._quiet_ns = start_ns  # likewise while commands are withheld
@@ -214,7 +220,15 @@ class CloudEndpoint(TunnelEnd):
 
     def next_deadline_ns(self) -> int:
         """Return when cloud has to send a computed command or to compute the next command [ns]."""
-        return self._tick_ns if self._unsent is None else self._unsent[0]
+        if self._unsent is not None:
+            return self._unsent[0]
+        return min(self._tick_ns, self._due_ns) if self._answers else self._tick_ns
+
+    @property
+    def _answers(self) -> bool:
+        """Whether cloud answers newer telemetry on its arrival, and can do it now."""
+        can = self._loop.ready and self._setpoint is not None and self._session.epoch != NO_EPOCH
+        return self._on_arrival and can
 
     def finish(self, now_ns: int) -> None:
         """Let the computation of the present command end at `now_ns` [ns]."""
@@ -231,8 +245,9 @@ class CloudEndpoint(TunnelEnd):
                 if (made := self._control) is not None:
                     self._records.append(Left(now_ns, made.epoch, made.counter))
             self._unsent = None
-            if now_ns < self._tick_ns:
-                return
+        if now_ns < self._tick_ns:
+            self._answer_if_due(now_ns)
+            return
         missed = (now_ns - self._tick_ns) // self._period_ns
         if missed:
             self._note_missed(missed, now_ns)
@@ -272,10 +287,19 @@ class CloudEndpoint(TunnelEnd):
         if self._alarm.sounds and (alarm := self._alarm.due(self._asked, now_ns)) is not None:
             self._relay(alarm)
         if self._loop.ready and self._setpoint is not None:
-            self._send_command(self._setpoint, now_ns)
+            if self._on_arrival:
+                self._answer_if_due(now_ns)
+            else:
+                self._send_command(self._setpoint, now_ns)
         elif now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_PERIOD_NS
             self._send(Kind.ALIVE, b"")
+
+    def _answer_if_due(self, now_ns: int) -> None:
+        """Send a command, if answers to telemetry are wanted and one is due."""
+        if self._answers and now_ns >= self._due_ns and self._setpoint is not None:
+            self._due_ns = now_ns + SILENT_PERIODS * self._period_ns // 2
+            self._send_command(self._setpoint, now_ns)
 
     def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Handle a datagram that arrived at `now_ns` [ns]; count and drop an invalid datagram."""
@@ -389,6 +413,7 @@ class CloudEndpoint(TunnelEnd):
             self._loop.expect((now_ns - self._start[1]) * 1e-9)
             self._start = None
         self._loop.observe(telemetry, now_ns)
+        self._due_ns = min(self._due_ns, max(now_ns, self._commanded_ns + self._period_ns // 2))
         if (followed := self._loop.plans.look_up(telemetry, now_ns)) is not None:
             self._records.append(followed)
         self._asked = max(self._asked, telemetry.mission)

@@ -392,6 +392,10 @@ class Cloud(Section):
     command_rate_hz: Annotated[int, Field(ge=COMMAND_RATE_MIN_HZ, le=COMMAND_RATE_MAX_HZ)] = 100
     """Rate of the commands [Hz]. At less than 20 Hz the guard would never leave HOLD, which takes
     10 commands within 500 ms"""
+    answers: Literal["period", "arrival"] = "period"
+    """When cloud computes a command. period: at command_rate_hz; arrival: as newer telemetry
+    arrives, at most once in half a period, and after 1.5 periods without any. Then no telemetry
+    waits for a period, but the downlink has more packets if both rates differ"""
     compute_ms: ComputeMs = 0.0
     """Mean of the emulated computing time of a command [ms]; or a CSV file with the column
     compute_ms or compute_s, of which each command takes a random row: `cloudrc measure compute`
@@ -424,6 +428,8 @@ class Cloud(Section):
     sharing: Sharing = "fifo"
     """How the clouds share cores. fifo: one computation after the other; ps: processor sharing, all
     at the same time, each more slowly"""
+
+    _write = leave_out_empty("answers")
 
     @model_validator(mode="after")
     def _check_compute(self) -> Cloud:

@@ -60,14 +60,17 @@ class Described(BaseModel):
 
 
 def leave_out_empty(*keys: str) -> Any:
-    """Let a section leave out these keys where they are null or (), so that its hash stays."""
+    """Let a section leave out these keys where they are null, () or at their default.
+
+    So the hash of a file from before them stays.
+    """
 
     def write(self: BaseModel, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         written: dict[str, Any] = handler(self)
         return {
             key: value
             for key, value in written.items()
-            if key not in keys or value not in (None, (), [])
+            if key not in keys or value not in (None, (), [], type(self).model_fields[key].default)
         }
 
     return model_serializer(mode="wrap")(write)
