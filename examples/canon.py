@@ -122,8 +122,11 @@ def many_plants(runs: int) -> gymnasium.Env[Floats, Floats]:
     return gymnasium.make("cloudrc/Linear-v0", A=A, B=np.eye(runs), R=1.0)
 
 
-def lqg(p: float, acknowledged: bool, runs: int, steps: int) -> Found:
-    """Cost per step if the controller hears which commands arrived (as TCP), or not (as UDP)."""
+def regulated(p: float, acknowledged: bool) -> tuple[float, float]:
+    """Return gain and cost per step of the best controller behind loss p both ways.
+
+    It hears which commands arrived (as TCP), or not (as UDP).
+    """
     share = 1.0 - p
     known, unknown = 1.0, 1.0  # prices of a state that the controller knows, and does not know
     for _ in range(10_000):
@@ -134,6 +137,12 @@ def lqg(p: float, acknowledged: bool, runs: int, steps: int) -> Found:
             1.0 + A * A * known - share * (A * known) ** 2 / price,
             1.0 + share * A * A * known + (1.0 - share) * A * A * unknown,
         )
+    return gain, share * known + (1.0 - share) * unknown
+
+
+def lqg(p: float, acknowledged: bool, runs: int, steps: int) -> Found:
+    """Cost per step of this controller."""
+    gain, exact = regulated(p, acknowledged)
     env = many_plants(runs)
     x = estimate = env.reset(seed=1)[0]
     cost = np.zeros(runs)
@@ -144,9 +153,37 @@ def lqg(p: float, acknowledged: bool, runs: int, steps: int) -> Found:
         sent = -gain * estimate
         applied = np.where(no_input, 0.0, sent)
         cost += x**2 + applied**2
-        estimate = A * estimate + (applied if acknowledged else share * sent)
+        estimate = A * estimate + (applied if acknowledged else (1.0 - p) * sent)
         x = env.step(applied)[0]
-    return share * known + (1.0 - share) * unknown, cost / steps
+    return exact, cost / steps
+
+
+def lqg_networked(p: float, acknowledged: bool, runs: int, steps: int) -> Found:
+    """Cost per step of this controller behind `Networked`: it answers in every step."""
+    gain, exact = regulated(p, acknowledged)
+    both, found = {way: {"loss": p} for way in ("uplink", "downlink")}, np.zeros(runs)
+    for seed in range(runs):
+        plant = gymnasium.make("cloudrc/Linear-v0", A=A, R=1.0, disable_env_checker=True)
+        env = Networked(
+            plant,
+            both,
+            seed,
+            hold="start",
+            answers="step",
+            acknowledge="ideal" if acknowledged else None,
+        )
+        seen, info = env.reset(seed=seed)
+        estimate = float(seen[0])
+        for step in range(steps):
+            sent = -gain * estimate
+            seen, reward, _, _, info = env.step(np.array([sent]))
+            found[seed] -= float(reward) / steps
+            about = info["cloudrc"]
+            arrived = step in about["acknowledged"][-1:] if acknowledged else 1.0 - p
+            estimate = A * estimate + arrived * sent
+            if about["observation_age"] == 0.0:
+                estimate = float(seen[0])
+    return exact, found
 
 
 # Packets with the inputs of the next N steps. D. E. Quevedo, D. Nesic, "Input-to-State Stability of
@@ -388,6 +425,8 @@ def rows() -> list[Row]:
         Row("the same with loss in bursts", partial(tail_index, 1.25, bursts), 40, 200_000),
         Row("Schenato 2007: LQG, loss .3, TCP-like", partial(lqg, 0.3, True), 200, 10_000),
         Row("LQG, loss .3, UDP-like", partial(lqg, 0.3, False), 200, 10_000),
+        Row("LQG through `Networked`, TCP-like", partial(lqg_networked, 0.3, True), 20, 10_000),
+        Row("LQG through `Networked`, UDP-like", partial(lqg_networked, 0.3, False), 20, 10_000),
     ]
     for name, size, hold in (
         ("Quevedo 2011: 1 input in a packet, loss .2", 1, False),

@@ -27,42 +27,63 @@ NEVER_NS = -1
 
 
 class Answers:
-    """The answers of an episode."""
+    """The answers of an episode, and the observations behind them.
+
+    An answer has a number: the tick of its observation, or, if the policy answers in every step,
+    the tick in which it is asked. Then one observation may be behind several answers.
+    """
 
     def __init__(self) -> None:
         """Begin an episode."""
-        self._rows: dict[int, list[int]] = {}
-        self._newest = 0  # tick of the answer that was received last
+        self._observations: dict[int, list[int]] = {}  # by tick: observed, sent, arrived [ns]
+        self._answers: dict[int, list[int]] = {}  # by number: begun, left, received, executed [ns]
+        self._basis: dict[int, list[int]] = {}  # by tick of the observation: its answers
+        self._newest = 0  # number of the answer that was received last
 
     def ask(self, tick: int, now_ns: int) -> None:
         """Note that the observation of a tick is sent at once [ns]."""
-        self._rows[tick] = [now_ns, now_ns, NEVER_NS, NEVER_NS, NEVER_NS, NEVER_NS, NEVER_NS]
+        self._observations[tick] = [now_ns, now_ns, NEVER_NS]
 
-    def note(self, tick: int, instant: int, at_ns: int) -> None:
-        """Note an instant [ns] of the answer to the observation of a tick."""
-        self._rows[tick][instant] = at_ns
+    def arrive(self, tick: int, at_ns: int) -> None:
+        """Note the arrival of the observation of a tick [ns]."""
+        self._observations[tick][ARRIVED] = at_ns
+
+    def begin(self, number: int, tick: int, at_ns: int) -> None:
+        """Note that the policy begins an answer to the observation of a tick [ns]."""
+        self._answers[number] = [at_ns, NEVER_NS, NEVER_NS, NEVER_NS]
+        self._basis.setdefault(tick, []).append(number)
+
+    def note(self, number: int, instant: int, at_ns: int) -> None:
+        """Note an instant [ns] of an answer: `LEFT` or `RECEIVED`."""
+        self._answers[number][instant - BEGUN] = at_ns
         if instant == RECEIVED:
-            self._newest = tick
+            self._newest = number
 
     def execute(self, basis: float, now_ns: int) -> None:
         """Note the execution of an action in a tick that began at `now_ns` [ns].
 
-        `basis` is the tick of its observation; if several observations are behind it, the answer
-        that was received last counts.
+        `basis` is the number of its answer; if several answers are behind it, the one that was
+        received last counts.
         """
-        tick = int(basis) if basis == int(basis) else self._newest
-        row = self._rows.get(tick)
-        if row is not None and row[EXECUTED] < 0 <= row[RECEIVED]:
-            row[EXECUTED] = max(now_ns, row[RECEIVED])
+        number = int(basis) if basis == int(basis) else self._newest
+        row = self._answers.get(number)
+        if row is not None and row[EXECUTED - BEGUN] < 0 <= row[RECEIVED - BEGUN]:
+            row[EXECUTED - BEGUN] = max(now_ns, row[RECEIVED - BEGUN])
 
     def table(self) -> dict[str, Instants]:
         """Return `tick` of the observation and the instants of `CUTS` [ns], each of shape (n,).
 
-        -1 stands for what never happened.
+        A row is an answer, or an observation without one. -1 stands for what never happened.
         """
-        rows = np.array([*self._rows.values()], np.int64).reshape(-1, len(CUTS))
-        ticks = np.array([*self._rows], np.int64)
-        return {"tick": ticks, **dict(zip(CUTS, rows.T, strict=True))}
+        no_answer = [[NEVER_NS] * 4]
+        found = [
+            [tick, *observed, *answer]
+            for tick, observed in self._observations.items()
+            for answer in [self._answers[number] for number in self._basis.get(tick, ())]
+            or no_answer
+        ]
+        columns = np.array(found, np.int64).reshape(-1, 1 + len(CUTS)).T
+        return dict(zip(("tick", *CUTS), columns, strict=True))
 
     def means(self) -> dict[str, float]:
         """Return `budget_` and the name of each stage -> its mean [s] over executed answers."""

@@ -168,3 +168,27 @@ class Lane:
             "bytes": self._size,
             "on_link": self._occupies,
         }
+
+
+class WaitingLane(Lane):
+    """The messages of a robot that wait until a shared channel sends them: the newest one waits.
+
+    Attributes:
+        waiting: Number of the waiting message, the message, and how many bytes it has more than
+            usual; None if none waits.
+    """
+
+    def begin(self, episode: int) -> None:
+        """Begin an episode without packets."""
+        super().begin(episode)
+        self.waiting: tuple[int, Any, int] | None = None
+
+    def send(self, number: int, now_ns: int, message: Any, more: int = 0) -> None:
+        """Let a message wait, in place of an older one."""
+        self.waiting = number, message, more
+
+    def leave(self, now_ns: int) -> None:
+        """Let the waiting message leave the channel at `now_ns` [ns]."""
+        assert self.waiting is not None, "the channel sends what waits"
+        (number, message, more), self.waiting = self.waiting, None
+        super().send(number, now_ns, message, more)

@@ -13,6 +13,8 @@ t = round(k dt), and W is how long the robot waits in a tick for an answer:
    It takes the newest observation that has arrived by then, and drops older ones. The answer leaves
    after the compute time, as the packet whose number is the tick of the observation: so the fate of
    a packet depends neither on the compute time nor on the executor.
+   If it answers in every tick, it begins at t at the earliest, with the newest observation that has
+   arrived by t + W, and the packet's number is that of the tick.
 4. The robot receives the answers that have arrived by t + W, and executes an action.
 
 So the age of the loop is dt max(0, ceil((up + compute + down - W) / dt)). One call of `step` has
@@ -22,6 +24,7 @@ one answer: of the questions that begin in one tick, the newest counts.
 from __future__ import annotations
 
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,7 +35,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from gymnasium.error import ResetNeeded
 
-from cloudrc.gym.answers import ARRIVED, BEGUN, LEFT, RECEIVED, Answers, Instants
+from cloudrc.gym.answers import LEFT, RECEIVED, Answers, Instants
 from cloudrc.gym.asked import Met, asked_of, expected
 from cloudrc.gym.doubts import doubts
 from cloudrc.gym.executors import Chunk, Committed, Executor
@@ -50,6 +53,8 @@ EPISODES = 1 << 20
 """Number of episodes that belong to a seed of the environment."""
 AGES = 100
 """Ages of actions that are counted apart [ticks]."""
+ACKNOWLEDGED = 100
+"""How many answers that reached the robot the policy is told of: the newest."""
 NO_LINK = LinkProfile(DirectionProfile(), DirectionProfile())
 """Link before the first episode."""
 _NEWEST: WeakValueDictionary[tuple[int, str], RemoteLoop] = WeakValueDictionary()
@@ -74,6 +79,9 @@ class Settings:
     action_bytes: int
     delivery: str  # one of DELIVERIES
     packet_bytes: int  # most bytes of a packet
+    answers_each_tick: bool = False  # whether the policy answers also without a new observation
+    acknowledges: bool = False  # whether the policy learns which answers reached the robot
+    slot: float = 0.0  # for how long a shared channel sends an observation [s]
 
     def wires(self, link: LinkProfile) -> tuple[Wire, Wire]:
         """Return the wire of observations and that of answers, over a link."""
@@ -107,13 +115,15 @@ class RemoteLoop:
         stream: str = "",
         *,
         judge: Callable[[Any], None] | None = None,
+        lane: type[Lane] = Lane,
     ) -> None:
         """Connect; `stream` is the name of the robot. Call `begin` for each episode.
 
-        `choose` returns the link of an episode.
+        `choose` returns the link of an episode. `lane` is the class of the uplink.
         `judge` raises an exception for a value of the executor that is no action.
         """
         self._settings, self._executor, self._judge = settings, executor, judge
+        self._lane = lane
         self.start, self.memory = settings.start, memory
         self._tick = -1  # before the first episode
         self.judge_link: Callable[[LinkProfile], bool] | None = None
@@ -129,9 +139,9 @@ class RemoteLoop:
         """Open both directions of the link that is chosen."""
         link, seed, stream = self._chosen.profile, self._settings.seed, self._stream
         start = partial(link.start_ns, seed, stream=stream)
-        self._up, self._down = (
-            Lane(wire, seed, stream, start) for wire in self._settings.wires(link)
-        )
+        up, down = self._settings.wires(link)
+        self._up = self._lane(up, seed, stream, start)
+        self._down = Lane(down, seed, stream, start)
 
     def begin(self, seed: int | None, observation: Any, info: Mapping[str, Any]) -> None:
         """Begin an episode: the policy has the first observation at once.
@@ -148,11 +158,15 @@ class RemoteLoop:
                 self.judge_link = None  # once
         self._up.begin(self._episode)
         self._down.begin(self._episode)
-        self._tick = self._now_ns = self._seen_tick = 0
+        self._tick = self._now_ns = self._seen_tick = self._number = 0
         _NEWEST[self._settings.seed, self._stream] = self
         self.seen, self._committed = [copied(observation), info], Committed()
         self.is_asked = True
+        self._taken_ns = 0  # when its newest observation arrived
         self._begin_ns = self._free_ns = 0  # when the policy began its last answer, and has it
+        self._sources = [0]  # if it answers in each tick: the tick of the observation behind each
+        self._reached = deque[tuple[int, int]]()  # arrival [ns] and number of answers at the robot
+        self._acknowledged = deque[int](maxlen=ACKNOWLEDGED)
         self._held = 0
         self._last, self._basis = self.start, -1.0
         self._is_held = False
@@ -162,8 +176,8 @@ class RemoteLoop:
         self._executor.basis = -1
         self.answers = Answers()
         self.answers.ask(0, 0)
-        self.answers.note(0, ARRIVED, 0)
-        self.answers.note(0, BEGUN, 0)
+        self.answers.arrive(0, 0)
+        self.answers.begin(0, 0, 0)
         self.memory.begin()
         late = self._ticks_late((self._up.wire, self._down.wire))
         self._executor.begin(late, round(self._settings.dt * 1e9))
@@ -190,6 +204,7 @@ class RemoteLoop:
         # Of a queue that fills, the first message tells the least age.
         (up, _), (down, _) = (expected(wire, dt, int(wire.exceeds_rate(dt))) for wire in wires)
         late = float(np.nan_to_num(up + down)) + settings.compute[0] - settings.answer_within
+        late += settings.slot
         return max(0, ceil(late / dt - 1e-6))
 
     def doubts(self, link: LinkProfile, count: int, longest: float) -> Iterator[str]:
@@ -223,6 +238,7 @@ class RemoteLoop:
         if self.is_asked:
             self.memory.add(actions[0])
             self._answer(actions)
+            self.is_asked = False
         self._receive(self._now_ns + self._within_ns)
         action = executor.action(tick)
         self._is_held = action is None
@@ -232,6 +248,8 @@ class RemoteLoop:
                 Quantity(ge=0, le=tick).of(executor.basis, "basis")
             self._last, self._basis = action, executor.basis
             self.answers.execute(executor.basis, self._now_ns)
+            if self._settings.answers_each_tick:
+                self._basis = self._sources[round(executor.basis)]
         else:
             self._held += 1
             if not self._settings.repeats:
@@ -244,15 +262,16 @@ class RemoteLoop:
 
     def _answer(self, actions: tuple[Any, ...]) -> None:
         """Send the answer to the newest observation that the policy has taken."""
-        chunk = Chunk(self._seen_tick, actions)
+        chunk = Chunk(self._number, actions)
         if self._settings.waits and not self._tick:
             self._executor.receive(chunk, 0)  # the episode begins when this answer has arrived
             self.answers.note(0, LEFT, 0)
             self.answers.note(0, RECEIVED, 0)
+            self._reached.append((0, 0))
             return
-        self._free_ns = self._begin_ns + self._time_to_compute()
-        self.answers.note(self._seen_tick, LEFT, self._free_ns)
-        self._down.send(self._seen_tick, self._free_ns, chunk)
+        self._free_ns = self._begin_ns + self._time_to_compute()  # which may be known only now
+        self.answers.note(self._number, LEFT, self._free_ns)
+        self._down.send(self._number, self._free_ns, chunk)
 
     def _receive(self, limit_ns: int) -> None:
         """Give the executor the answers that have arrived by `limit_ns` [ns]."""
@@ -262,12 +281,25 @@ class RemoteLoop:
         while queue.next_ns <= limit_ns:
             at_ns, _, chunk = queue.pop()
             self.answers.note(chunk.basis, RECEIVED, at_ns)
-            if chunk.basis:
-                self._loop_ages.append(self._tick - chunk.basis)
+            basis = chunk.basis
+            if self._settings.answers_each_tick:
+                basis = self._sources[basis]
+            if basis:
+                self._loop_ages.append(self._tick - basis)
+            if self._settings.acknowledges:
+                self._reached.append((at_ns, chunk.basis))
             self._executor.receive(chunk, self._tick)
 
     def observe(self, observation: Any, info: Mapping[str, Any]) -> None:
         """Move to the next tick, in which the world gives an observation and its info."""
+        self.send(observation, info)
+        self.ask()
+
+    def send(self, observation: Any, info: Mapping[str, Any]) -> None:
+        """Move to the next tick: the robot receives, and sends what the world gives.
+
+        Call `ask` before the robot acts; until then, `take` may be called.
+        """
         self._tick = tick = self._tick + 1
         self._now_ns = now_ns = round(tick * self._settings.dt * 1e9)
         self._receive(now_ns)
@@ -277,30 +309,48 @@ class RemoteLoop:
             more = size_of(committed.actions) if committed.actions else 0
             self._up.send(tick, now_ns, message, more)
             self.answers.ask(tick, now_ns)
-        self._ask(now_ns + self._within_ns)
-        if self._seen_tick:
-            self._observation_ages.append(tick - self._seen_tick)
 
-    def _ask(self, limit_ns: int) -> None:
-        """Let the policy begin with the observations that have arrived by `limit_ns` [ns]."""
+    def ask(self) -> None:
+        """Let the policy take what arrives in this tick before the robot acts, and begin."""
+        limit_ns = self._now_ns + self._within_ns
+        self.take(limit_ns)
+        if self._settings.answers_each_tick:
+            self._sources.append(self._seen_tick)
+            begin_ns = max(self._now_ns, self._free_ns, self._taken_ns)
+            self.is_asked = begin_ns <= limit_ns  # else it still computes
+            if self.is_asked:
+                self._begin(self._tick, begin_ns)
+        if self._seen_tick:
+            self._observation_ages.append(self._tick - self._seen_tick)
+
+    def take(self, limit_ns: int) -> None:
+        """Let the policy begin with the observations that have arrived by `limit_ns` [ns].
+
+        A policy that answers in each tick only keeps the newest one.
+        """
         if self._up.is_stream:
             self._up.run(limit_ns)
-        queue, self.is_asked = self._up.queue, False
-        while (begin_ns := max(queue.next_ns, self._free_ns)) <= limit_ns:
+        queue, begins = self._up.queue, not self._settings.answers_each_tick
+        while (begin_ns := max(queue.next_ns, begins * self._free_ns)) <= limit_ns:
             before = self._seen_tick
             while queue.next_ns <= begin_ns:
-                at_ns, _, message = queue.pop()
-                self.answers.note(message[0], ARRIVED, at_ns)
+                self._taken_ns, _, message = queue.pop()
+                self.answers.arrive(message[0], self._taken_ns)
                 if message[0] > self._seen_tick:
                     self._seen_tick, self._committed, *self.seen = message
-            if self._seen_tick > before:
-                self.is_asked, self._begin_ns = True, begin_ns
-                self._free_ns = begin_ns + self._time_to_compute()
-                self.answers.note(self._seen_tick, BEGUN, begin_ns)
+            if begins and self._seen_tick > before:
+                self.is_asked = True
+                self._begin(self._seen_tick, begin_ns)
+
+    def _begin(self, number: int, begin_ns: int) -> None:
+        """Let the policy begin the answer with a number at a time [ns]."""
+        self._number, self._begin_ns = number, begin_ns
+        self._free_ns = begin_ns + self._time_to_compute()
+        self.answers.begin(number, self._seen_tick, begin_ns)
 
     def _time_to_compute(self) -> int:
-        """Return how long the policy computes the answer to its newest observation [ns]."""
-        return round(self.compute(self._seen_tick) * 1e9)
+        """Return how long the policy computes its newest answer [ns]."""
+        return round(self.compute(self._number) * 1e9)
 
     def _draw_time(self, tick: int) -> float:
         mean, deviation = self._settings.compute
@@ -330,6 +380,8 @@ class RemoteLoop:
         }
         if self._committed.actions:
             found["prefix"], found["delay"] = self._committed
+        if self._settings.acknowledges:
+            found["acknowledged"] = self._acknowledge()
         return found
 
     def timeline(self) -> dict[str, Instants]:
@@ -337,6 +389,33 @@ class RemoteLoop:
         if self._tick < 0:
             raise ResetNeeded("call reset() before timeline()")
         return self.answers.table()
+
+    def _acknowledge(self) -> tuple[int, ...]:
+        """Return the ticks of the newest answers of which the policy knows that they arrived."""
+        known_ns = self._now_ns - round(self._up.wire.profile.delay_ms * 1e6)
+        while self._reached and self._reached[0][0] <= known_ns:
+            self._acknowledged.append(self._reached.popleft()[1])
+        return tuple(self._acknowledged)
+
+    @property
+    def uplink(self) -> Lane:
+        """The messages from the robot."""
+        return self._up
+
+    @property
+    def tick(self) -> int:
+        """Number of the present tick."""
+        return self._tick
+
+    @property
+    def seen_tick(self) -> int:
+        """Tick of the newest observation that the policy has taken."""
+        return self._seen_tick
+
+    @property
+    def acts_ns(self) -> int:
+        """When the robot acts in the present tick [ns]."""
+        return self._now_ns + self._within_ns
 
     def summary(self) -> dict[str, Any]:
         """Return what the loop was like in this episode: asked and measured.

@@ -83,6 +83,10 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             observe_actions: How many of its last actions it also observes; of chunks, the first.
             observe_step: Whether it also observes the step of its observation. With any of the
                 three, observations are mappings, as those of `Remembering`.
+            answers: "arrival": the policy answers an observation when it arrives; "step": it
+                answers in each step, with the newest observation that it has.
+            acknowledge: "ideal": the policy learns which of its answers reached the robot, an
+                uplink delay later; None: it does not.
 
         Raises:
             cloudrc.errors.CloudrcError: If a value cannot be used; the text says what to change.

@@ -19,7 +19,7 @@ from gymnasium.vector.utils import batch_space, iterate
 from cloudrc import plugins
 from cloudrc.gym.doubts import LinkWarning
 from cloudrc.gym.executors import Executor
-from cloudrc.gym.lane import DATAGRAMS, DELIVERIES
+from cloudrc.gym.lane import DATAGRAMS, DELIVERIES, Lane, WaitingLane
 from cloudrc.gym.links import Links, choose_link
 from cloudrc.gym.loop import RemoteLoop, Settings
 from cloudrc.gym.memory import Remembering
@@ -67,6 +67,8 @@ class Options(TypedDict, total=False):
     observe_age: bool
     observe_actions: int
     observe_step: bool
+    answers: str
+    acknowledge: str | None
 
 
 DEFAULTS: Options = {
@@ -84,6 +86,8 @@ DEFAULTS: Options = {
     "observe_age": False,
     "observe_actions": 0,
     "observe_step": False,
+    "answers": "arrival",
+    "acknowledge": None,
 }
 ARGUMENTS = ("env", "link", "seed", "dt", "stream", *DEFAULTS)
 """Names of the arguments of `Networked` and `NetworkedVector`."""
@@ -95,6 +99,9 @@ def read_options(what: str, given: Options) -> Options:
     read: dict[str, Any] = {**DEFAULTS, **given}
     check_names("hold", [read["hold"]], ("repeat", "start"))
     check_names("delivery", [read["delivery"]], DELIVERIES)
+    check_names("answers", [read["answers"]], ("arrival", "step"))
+    if read["acknowledge"] is not None:
+        check_names("acknowledge", [read["acknowledge"]], ("ideal",))
     for name, (quantity, wanted) in COUNTS.items():
         if read[name] is not None:
             with naming(name, f"None, or {wanted}"):
@@ -112,11 +119,14 @@ def connect(
     seed: int,
     streams: Iterable[str],
     options: Options,
+    *,
+    slot: float | None = None,
 ) -> tuple[list[RemoteLoop], list[LinkProfile]]:
     """Connect a robot of each of the `streams` with its policy; also return the known links.
 
     `spaces` are those of an observation and of an action; `dt` is the time of a step [s]. All
-    `options` are there, as `read_options` returns them.
+    `options` are there, as `read_options` returns them. With a `slot`, observations wait for a
+    channel that sends each for so long [s].
     """
     observations, actions = spaces
     start, chunk = options["start"], options["chunk"]
@@ -139,13 +149,17 @@ def connect(
         action_bytes=size_of(start) * (chunk or 1) if answer is None else answer,
         delivery=options["delivery"],
         packet_bytes=options["packet_bytes"],
+        answers_each_tick=options["answers"] == "step",
+        acknowledges=options["acknowledge"] is not None,
+        slot=slot or 0.0,
     )
     choose, known = choose_link(link, seed)
     check, loops = checker(actions, "one action, or None"), list[RemoteLoop]()
     for stream in streams:
         own, is_ours = find_executor(options["executor"], actions, chunked=chunk is not None)
         memory, judge = Remembering(spaces, options, settings.start), None if is_ours else check
-        loops.append(RemoteLoop(settings, choose, own, memory, stream, judge=judge))
+        lane = Lane if slot is None else WaitingLane
+        loops.append(RemoteLoop(settings, choose, own, memory, stream, judge=judge, lane=lane))
     return loops, known
 
 

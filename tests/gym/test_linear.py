@@ -17,6 +17,7 @@ LIKE_ANOTHER = [
     "at 3",
     "the same with loss in bursts",
     "LQG, loss .3, UDP-like",
+    "LQG through `Networked`, UDP-like",
     "2 inputs in a packet",
     "all inputs in a packet",
     "Schenato 2009: 1 input, held",
