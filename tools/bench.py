@@ -21,8 +21,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,7 +31,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.gym import Networked
+from cloudrc.gym import Channel, Networked
 from cloudrc.runs.bench import FLIGHTS, STEPS
 from cloudrc.text import table
 
@@ -61,6 +62,8 @@ KINDS = {
 ENVIRONMENTS = "CartPole-v1", "Pendulum-v1"
 STEP_MAX = 20.0
 """Largest processor time of a step of `Networked`, without the environment's [us]."""
+ROBOTS, ROBOT_STEPS, CHANNEL_MAX = 20, 2_000, 1.3
+"""Robots that share a channel; their steps; largest cost of one's step in steps of `Networked`."""
 
 
 class Measured(NamedTuple):
@@ -204,6 +207,46 @@ def networked() -> list[tuple[str, ...]]:
     return rows
 
 
+def of_channel(count: int, steps: int) -> Iterator[None]:
+    """Play `count` pendulums that share a channel; yield after each of their steps."""
+    envs = [gymnasium.make("Pendulum-v1", max_episode_steps=steps) for _ in range(count)]
+    channel = Channel(envs, "lte")
+    for robot, seen, info in channel.play(1, steps * channel.dt[0]):
+        if info["cloudrc"]["asked"]:
+            channel.answer(robot, -4.0 * seen[1:2] - seen[2:])
+        if robot == count - 1:
+            yield
+
+
+def of_networked(steps: int) -> Iterator[None]:
+    """Play one pendulum alone; yield after each of its steps."""
+    env = Networked(gymnasium.make("Pendulum-v1", max_episode_steps=steps), "lte")
+    seen, info = env.reset(seed=1)
+    for _ in range(steps):
+        if info["cloudrc"]["asked"]:
+            action = -4.0 * seen[1:2] - seen[2:]
+        seen, *_, info = env.step(action)
+        yield
+
+
+def shared(repeats: int = 5) -> list[tuple[str, ...]]:
+    """Measure a robot's step on a shared channel beside a step of `Networked`."""
+
+    def cost(make: Callable[[], Iterator[None]]) -> float:
+        spent = list[NDArray[np.float64]]()
+        for _ in range(repeats):
+            spent.append(np.diff([time.thread_time() for _ in make()]))
+        return float(np.min(spent, axis=0).mean())
+
+    alone = cost(partial(of_networked, ROBOT_STEPS))
+    ratio = cost(partial(of_channel, ROBOTS, ROBOT_STEPS)) / ROBOTS / alone
+    missed = "MISSED" if ratio > CHANNEL_MAX else ""
+    return [
+        ("Channel, lte, step of a robot", "x alone", "asked", ""),
+        (f"{ROBOTS} Pendulum-v1", f"{ratio:.2f}", f"<= {CHANNEL_MAX:g}", missed),
+    ]
+
+
 def main() -> int:
     """Measure, print the results and return the exit code."""
     parser = argparse.ArgumentParser(prog="make bench", description=__doc__)
@@ -222,7 +265,7 @@ def main() -> int:
     else:
         names = [name for name in names if name != STEPS]
         tables = [beside_steps(names, options.flights)]
-        tables += [] if options.rows else [networked()]
+        tables += [] if options.rows else [networked(), shared()]
     for rows in tables:
         print(table(rows, right=range(1, 5)), end="\n\n", flush=True)
     return int(any("MISSED" in row for rows in tables for row in rows))

@@ -15,10 +15,12 @@ except ImportError:
         "cloudrc.gym needs gymnasium (not installed); run: pip install 'cloudrc[gym]'"
     ) from None
 
+from cloudrc.gym.channel import Channel
 from cloudrc.gym.networked import Networked
 from cloudrc.gym.registration import register as _register
+from cloudrc.gym.schedules import Waiting
 from cloudrc.gym.vector import NetworkedVector
 
-__all__ = ["Networked", "NetworkedVector"]
+__all__ = ["Channel", "Networked", "NetworkedVector", "Waiting"]
 
 _register()

@@ -72,8 +72,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             chunk: Number of actions in an answer, from the observation's tick on; None: only one.
             executor: How the robot executes answers: name of a plug-in, or path of a file.
             hold: Without an action it executes the last one, "repeat", or `start`, "start".
-            start: Action before the first answer arrives; None: 0, or what is nearest to it;
-                "answer": the episode begins when the robot has its first answer.
+            start: Action before the first answer; None: 0, or nearest to it; "answer": it waits.
             observation_bytes, action_bytes: Sizes on the wire [bytes]; None: those of the arrays.
             delivery: "datagrams": a lost packet loses its message; "stream": it makes it late.
             packet_bytes: Most bytes of a packet of a message.
@@ -81,12 +80,9 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             stream: Name of the robot, which with the seed selects its random numbers.
             observe_age: Whether the policy also observes the age of its observation [s].
             observe_actions: How many of its last actions it also observes; of chunks, the first.
-            observe_step: Whether it also observes the step of its observation. With any of the
-                three, observations are mappings, as those of `Remembering`.
-            answers: "arrival": the policy answers an observation when it arrives; "step": it
-                answers in each step, with the newest observation that it has.
-            acknowledge: "ideal": the policy learns which of its answers reached the robot, an
-                uplink delay later; None: it does not.
+            observe_step: Whether it also observes its step; see `Remembering` for all three.
+            answers: "arrival": the policy answers what arrives; "step": it answers in each step.
+            acknowledge: "ideal": the policy learns which answers reached the robot; or None.
 
         Raises:
             cloudrc.errors.CloudrcError: If a value cannot be used; the text says what to change.
