@@ -113,6 +113,10 @@ def _episode_arguments(parser: Parser) -> None:
     parser.add_argument("--dt", type=number(1e-6, 3600, "seconds"), metavar="S", help=about)
     about = "longest episode in steps (default: 10000)"
     parser.add_argument("--max-steps", type=read_count, default=10_000, metavar="N", help=about)
+    about = "robots that play an episode together, with --channel (default: 1)"
+    parser.add_argument("--robots", type=read_count, default=1, metavar="N", help=about)
+    about = "file of the channel that they share: slot_ms, per_slot, schedule (YAML)"
+    parser.add_argument("--channel", type=Path, metavar="FILE", help=about)
     about = "largest age of an observation behind an action, in s; older: late"
     parser.add_argument("--deadline", type=number(1e-6, 3600, "seconds"), metavar="S", help=about)
 
@@ -247,6 +251,8 @@ def _read(options: Options) -> tuple[EvalSetup, list[Episode]]:
         observe_age=options.observe_age,
         observe_actions=options.observe_actions,
         observe_step=options.observe_step,
+        robots=options.robots,
+        channel=values.read_channel(options.channel, options.robots),
     )
     values.check_policy(setup.policy)
     values.check_rows(options.rows)

@@ -12,7 +12,7 @@ from typing import Any
 
 from cloudrc.config.compute import read_times
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
-from cloudrc.eval.setup import FILE, MEASURED, SEED, Compute, radio_ms
+from cloudrc.eval.setup import FILE, MEASURED, SEED, Compute, SharedChannel, radio_ms
 from cloudrc.gym.options import ANSWER
 from cloudrc.link.library import read_profile
 from cloudrc.outside.address import check_url
@@ -142,6 +142,22 @@ def _pairs(flag: str, texts: list[str], example: str) -> dict[str, Any]:
             raise BadInputError(f"{flag} {text}: give KEY=VALUE, such as {example}")
         value = "null" if value == "None" else value
         found[key] = value if value == SEED else parse_value(value, f"{flag} {key}")
+    return found
+
+
+def read_channel(path: Path | None, robots: int) -> SharedChannel | None:
+    """Read the file of a channel that so many `robots` share."""
+    if (path is None) != (robots == 1):
+        raise BadInputError("give --robots, the number of robots, and --channel, what they share")
+    if path is None:
+        return None
+    tree = read_document(path, path.name).tree
+    check_names("key", tree, SharedChannel._fields, f"{path}: ")
+    found = SharedChannel(**tree)
+    if not isinstance(found.schedule, str):
+        raise BadInputError(f"{path}: schedule: give a name, or the path of a file")
+    if is_path(found.schedule):  # beside the file that names it
+        found = found._replace(schedule=os.path.join(path.parent, found.schedule))
     return found
 
 

@@ -14,7 +14,6 @@ from functools import cache
 from hashlib import sha256
 from math import isfinite
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import gymnasium
@@ -28,69 +27,23 @@ from cloudrc.drivers.openpi.actions import PolicyAnswerError, read_actions
 from cloudrc.errors import CloudrcError
 from cloudrc.eval.environment import environment_code, find_module
 from cloudrc.eval.setup import BARE, SEED, Episode, EvalSetup, link_at
+from cloudrc.eval.tally import Tally, Witness
 from cloudrc.files import write_json
-from cloudrc.gym import Networked
+from cloudrc.gym import Channel, Networked
 from cloudrc.gym.answers import to_document
 from cloudrc.gym.options import ANSWER
 from cloudrc.gym.step import find_step
-from cloudrc.gym.values import leaves, size_of
+from cloudrc.gym.values import size_of
 from cloudrc.outside.code import calling
 from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import ANY, RESULT, InvalidValueError, to_arrays, to_boolean
+from cloudrc.outside.values import ANY, InvalidValueError
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
 from cloudrc.policy.observation import observe
-from cloudrc.rounding import exceeds
 
-SUCCESS = ("success", "is_success")
-"""Keys of an environment's info that tell whether the task is done; one true value is enough."""
 AGE_NUMBERS = {"": "_mean", "_p99": "_p99", "_of": "_of", "_max": "_max", "_peak": "_peak_mean"}
 """End of a number of ages in a row -> in the summary of a loop."""
 Ask = Callable[[dict[str, Any]], Any]
 """Function that returns a policy's answer to its observation."""
-
-
-class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Sees what the world does, which no delay changes: executed actions, states, rewards."""
-
-    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.digest = sha256()
-        self.action: Any = None
-
-    def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode."""
-        observation, info = self.env.reset(**given)
-        self._note(observation)
-        return observation, info
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Execute an action."""
-        self.action = action
-        observation, given, terminated, truncated, info = self.env.step(action)
-        reward = _reward_of(given)
-        ends = [
-            to_boolean(_one(each), name)
-            for each, name in ((terminated, "terminated"), (truncated, "truncated"))
-        ]
-        self._note([action, observation, reward])
-        return observation, reward, *ends, dict(info)
-
-    def _note(self, values: Any) -> None:
-        for value in leaves(values):
-            self.digest.update(np.asarray(to_arrays(value)).tobytes())
-
-
-def _reward_of(given: Any) -> float:
-    """Return the reward of a step, which may be a boolean; raise a ValueError for a wrong value."""
-    given = _one(given)
-    is_boolean = isinstance(given, bool | np.bool_)
-    return float(given) if is_boolean else RESULT.of(given, "reward")
-
-
-def _one(given: Any) -> Any:
-    """Return the value of an array of one, as environments that are made for vectors give it."""
-    given = to_arrays(given)
-    return given.reshape(())[()] if isinstance(given, np.ndarray) and given.size == 1 else given
 
 
 def play(
@@ -105,9 +58,23 @@ def play(
         setup, played = replace(setup, **BARE), Episode(episode.rtt_ms, "newest", episode.seed)
     with make_env(setup, episode.seed) as env, asking(setup) as ask:
         ended, success, digest, numbers, loop = _play(played, setup, env, ask)
-    numbers |= _numbers_of(loop)
+    numbers |= numbers_of(loop)
     if keep:
         write_json(keep, to_document(loop["timeline"]))
+    return row_of(episode, setup, key, ended, success, digest, numbers, loop)
+
+
+def row_of(
+    episode: Episode,
+    setup: EvalSetup,
+    key: str,
+    ended: str,
+    success: bool | None,
+    digest: str,
+    numbers: Mapping[str, float | None],
+    loop: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the row of an episode that has been played."""
     judged = {None: "done", True: "success", False: "failure"}
     return {
         "key": key,
@@ -126,7 +93,7 @@ def play(
     }
 
 
-def _numbers_of(loop: Mapping[str, Any]) -> dict[str, float]:
+def numbers_of(loop: Mapping[str, Any]) -> dict[str, float]:
     """Return what a row tells about the loop: ages [s], delays [s] and losses."""
     found = {"loop_age": loop["loop_age"]}
     for name in ("observation_age", "action_age"):
@@ -157,10 +124,10 @@ def make_env(setup: EvalSetup, seed: int) -> Iterator[gymnasium.Env[Any, Any]]:
 
 
 @contextmanager
-def asking(setup: EvalSetup) -> Iterator[Ask]:
-    """Begin an episode of the policy; yield the function that asks it."""
+def asking(setup: EvalSetup, robot: int = 0) -> Iterator[Ask]:
+    """Begin an episode of the policy of a robot; yield the function that asks it."""
     if not setup.is_remote:
-        policy = _load(setup.policy)
+        policy = _load(setup.policy, robot)
         policy.reset()
         yield policy.infer
         return
@@ -171,10 +138,13 @@ def asking(setup: EvalSetup) -> Iterator[Ask]:
         yield client.infer
 
 
-_load = cache(LoadedPolicy)  # it may have to load weights
+@cache  # it may have to load weights
+def _load(policy: str, robot: int = 0) -> LoadedPolicy:
+    """Load the policy of a robot: each has its own, which may have a state."""
+    return LoadedPolicy(policy)
 
 
-class _Policy:
+class AskedPolicy:
     """A policy that answers with chunks of one size, in the form of the action space."""
 
     def __init__(self, ask: Ask, setup: EvalSetup, space: spaces.Space[Any]) -> None:
@@ -250,8 +220,8 @@ def _play(
     It ends "terminated" or "truncated" by the environment, or by its "limit". The success is None
     if the environment does not tell.
     """
-    witness, policy = _Witness(env), _Policy(ask, setup, env.action_space)
-    observation, _ = Networked(witness, **_beginning(setup, env)).reset(seed=episode.seed)
+    witness, policy = Witness(env), AskedPolicy(ask, setup, env.action_space)
+    observation, _ = Networked(witness, **beginning(setup, env)).reset(seed=episode.seed)
     chunk = policy(observation)  # the first answer, whose size the link has to know
     world, doubts = _connect(witness, episode, setup, policy, len(chunk))
     witness.digest = sha256()
@@ -260,67 +230,60 @@ def _play(
         world.compute = lambda tick: times[(episode.seed + tick) % len(times)]
     if setup.is_measured:
         world.compute = lambda tick: policy.duration
-    total, steps, stale, ended = 0.0, 0, 0, "limit"
-    jumps, before, basis, success = list[float](), None, -1.0, None
-    while steps < setup.max_steps and ended == "limit":
+    tally, ended = Tally(witness, setup), "limit"
+    while tally.steps < setup.max_steps and ended == "limit":
         about = info["cloudrc"]
-        if about["asked"] and steps:
+        if about["asked"] and tally.steps:
             chunk = policy(observation, about.get("prefix", ()), about.get("delay", 0))
-        observation, reward, terminated, truncated, info = world.step(chunk)
-        steps, total = steps + 1, total + reward
-        about = info["cloudrc"]
-        stale += about["held"]
-        if isfinite(about["action_age"]) and not about["held"]:
-            now = steps - 1 - about["action_age"] / world.dt
-            if before is not None and abs(now - basis) > 1e-6:
-                jump = np.subtract(witness.action, before, dtype=float)  # they may be booleans
-                jumps.append(float(np.linalg.norm(jump)))
-            basis = now
-        before = witness.action
-        if setup.success_at is None:
-            success = _success(success, world.world_info)
+        observation, _, terminated, truncated, info = world.step(chunk)
+        tally.count(info["cloudrc"], world.dt)
         if terminated or truncated:
             ended = "terminated" if terminated else "truncated"
-    if setup.success_at is not None:
-        success = not exceeds(setup.success_at, total)
-    numbers = {
-        "return": total,
-        "steps": steps,
-        "success": None if success is None else int(success),
-        "stale_share": stale / steps,
-        "seam_jump": fmean(jumps) if jumps else None,
-    }
+    success, numbers = tally.numbers()
     loop = {**world.summary(), "doubts": doubts, "timeline": world.timeline()}
     return ended, success, witness.digest.hexdigest(), numbers, loop
 
 
 def _connect(
-    env: gymnasium.Env[Any, Any], episode: Episode, setup: EvalSetup, policy: _Policy, count: int
+    env: gymnasium.Env[Any, Any],
+    episode: Episode,
+    setup: EvalSetup,
+    policy: AskedPolicy,
+    count: int,
 ) -> tuple[Networked, list[str]]:
     """Put the link between environment and policy, which has answered with `count` actions.
 
     Also return what `Networked` warns of.
     """
-    sent = setup.observation_bytes
-    with _hearing() as doubts:
-        world = Networked(
-            env,
-            link_at(setup.link, episode.rtt_ms),
-            episode.seed,
-            compute=policy.duration if setup.is_measured else setup.compute_times,
-            answer_within=setup.answer_within,
-            deadline=setup.deadline,
-            chunk=count,
-            executor=episode.chosen,
-            observation_bytes=policy.size if sent is None else sent,
-            delivery=setup.delivery,
-            packet_bytes=setup.packet_bytes,
-            **_beginning(setup, env),
-        )
+    with hearing() as doubts:
+        given = options_of(env, episode, setup, policy, count)
+        world = Networked(env, link_at(setup.link, episode.rtt_ms), episode.seed, **given)
     return world, doubts
 
 
-def _beginning(setup: EvalSetup, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+def options_of(
+    env: gymnasium.Env[Any, Any],
+    episode: Episode,
+    setup: EvalSetup,
+    policy: AskedPolicy,
+    count: int,
+) -> dict[str, Any]:
+    """Return the options of the loop of a policy, which has answered with `count` actions."""
+    sent = setup.observation_bytes
+    return {
+        "compute": policy.duration if setup.is_measured else setup.compute_times,
+        "answer_within": setup.answer_within,
+        "deadline": setup.deadline,
+        "chunk": count,
+        "executor": episode.chosen,
+        "observation_bytes": policy.size if sent is None else sent,
+        "delivery": setup.delivery,
+        "packet_bytes": setup.packet_bytes,
+        **beginning(setup, env),
+    }
+
+
+def beginning(setup: EvalSetup, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     """Return the arguments of `Networked` that the first observation depends on."""
     start, space = setup.start, env.action_space
     if start not in (None, ANSWER):
@@ -335,22 +298,13 @@ def _beginning(setup: EvalSetup, env: gymnasium.Env[Any, Any]) -> dict[str, Any]
 
 
 @contextmanager
-def _hearing() -> Iterator[list[str]]:
+def hearing() -> Iterator[list[str]]:
     """Yield a list that has what was warned of, once the block is over."""
     found = list[str]()
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
         yield found
     found += dict.fromkeys(str(each.message) for each in seen)
-
-
-def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
-    """Return whether the task was done in any step so far; None if the info never told."""
-    for key in SUCCESS:
-        if info.get(key) is not None:
-            name = f"info['{key}'] (see --success-at)"
-            known = to_boolean(_one(info[key]), name) or bool(known)
-    return known
 
 
 def check_environment(setup: EvalSetup, episodes: list[Episode]) -> tuple[EvalSetup, list[str]]:
@@ -364,7 +318,7 @@ def check_environment(setup: EvalSetup, episodes: list[Episode]) -> tuple[EvalSe
             width_of(env.action_space)
             step = find_step(env, setup.dt)
         setup = replace(setup, step=step, env_code=environment_code(env, setup))
-        given = _beginning(setup, env)
+        given = beginning(setup, env)
         for episode in {each.point["executor"]: each for each in episodes}.values():
             wait = setup.answer_within
             Networked(env, chunk=1, executor=episode.chosen, answer_within=wait, **given)
@@ -375,7 +329,10 @@ def check_environment(setup: EvalSetup, episodes: list[Episode]) -> tuple[EvalSe
         given |= {"delivery": setup.delivery, "packet_bytes": setup.packet_bytes}
         given |= {"compute": 0.0 if setup.is_measured else setup.compute_times}
         limited = TimeLimit(env, setup.max_steps)
-        with _hearing() as doubts:
+        if setup.channel:
+            with naming("--channel"):
+                Channel([env], chunk=1, **setup.channel._asdict(), **beginning(setup, env))
+        with hearing() as doubts:
             for rtt in sorted({each.rtt_ms for each in episodes}, key=str):
                 Networked(limited, link_at(setup.link, rtt), observation_bytes=size, **given)
     if not setup.is_remote:
@@ -387,8 +344,8 @@ def check_environment(setup: EvalSetup, episodes: list[Episode]) -> tuple[EvalSe
 
 def _first_observation(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> tuple[str, int]:
     """Return hash and size [bytes] of the observation with which the seed 1 begins."""
-    witness = _Witness(env)
-    observation, _ = Networked(witness, **_beginning(setup, env)).reset(seed=1)
+    witness = Witness(env)
+    observation, _ = Networked(witness, **beginning(setup, env)).reset(seed=1)
     return witness.digest.hexdigest(), _sent_size(observation, setup)
 
 

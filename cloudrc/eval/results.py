@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 
 from cloudrc import source
 from cloudrc.errors import CloudrcError
-from cloudrc.eval.episode import play
+from cloudrc.eval.episode import play as play_alone
+from cloudrc.eval.robots import play as play_together
 from cloudrc.eval.setup import Episode, EvalSetup
 from cloudrc.files import read_json, write_json
 from cloudrc.outside.reuse import reuse_results
@@ -45,6 +46,9 @@ PAIRED = (
     "packet_bytes",
     "start",
     "hold",
+    "robots",
+    "channel",
+    "schedule",
 )
 """What two evaluations must share for a comparison of their policies."""
 FLAGS = {"delivery": "--delivery", "packet_bytes": "--packet-bytes"}
@@ -148,6 +152,7 @@ class EpisodeTrial(NamedTuple):
 
     def play(self) -> Row:
         """Play it; return its row."""
+        play = play_together if self.setup.channel else play_alone
         return play(self.episode, self.setup, self.key, self.keep)
 
 
@@ -226,7 +231,7 @@ def read_versus(folder: Path, setup: EvalSetup, episodes: Sequence[Episode]) -> 
     had = _read(folder)
     before = {**had["identity"], "code": had["code"]}
     now = {**setup.identity(), "code": source.code_hash()}
-    if other := [name for name in PAIRED if before.get(name) != now[name]]:
+    if other := [name for name in PAIRED if before.get(name) != now.get(name)]:
         told = ", ".join(FLAGS.get(name, name) for name in other)
         hint = f" (it has --delivery {before.get('delivery')})" * ("delivery" in other)
         raise InvalidValueError(f"differs in {told}{hint}; evaluate it again")
@@ -236,11 +241,17 @@ def read_versus(folder: Path, setup: EvalSetup, episodes: Sequence[Episode]) -> 
 
 def describe_success(setup: EvalSetup, outcomes: Sequence[Mapping[str, Any]]) -> str:
     """Say in words what counts as a success."""
+    of_all, means = "", ""
+    if setup.channel:
+        of_all, means = (
+            f", for each of {setup.robots} robots",
+            "; numbers are means over the robots",
+        )
     if setup.success_at is not None:
-        return f"a return of at least {setup.success_at:g}"
+        return f"a return of at least {setup.success_at:g}{of_all}{means}"
     if any("successes" not in each for each in outcomes):
-        return "unknown: the environment's info has no success; the return is measured"
-    return "the environment's info says success in some step"
+        return f"unknown: the environment's info has no success; the return is measured{means}"
+    return f"the environment's info says success in some step{of_all}{means}"
 
 
 def as_text(document: Mapping[str, Any]) -> str:

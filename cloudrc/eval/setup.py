@@ -12,7 +12,7 @@ from hashlib import sha256
 from math import isnan
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, NamedTuple
 
 from cloudrc.gym.lane import DATAGRAMS, Wire
 from cloudrc.gym.options import ANSWER
@@ -45,6 +45,18 @@ BARE: dict[str, Any] = {
 """What these episodes have in place of the values of the setup."""
 
 
+class SharedChannel(NamedTuple):
+    """A channel that the robots of an episode share, as `cloudrc.gym.Channel` takes it."""
+
+    slot_ms: float | None = None  # time of a slot [ms]; None: that of a step
+    per_slot: int = 1  # observations that leave in a slot
+    schedule: str | None = "round_robin"  # a name, or the path of a file; None: nothing is shared
+
+    def __str__(self) -> str:
+        slot = "in a step" if self.slot_ms is None else f"in {self.slot_ms:g} ms"
+        return f"a channel ({self.per_slot} {slot}, {self.schedule})"
+
+
 @dataclass(frozen=True)
 class EvalSetup:
     """An evaluation without its conditions; all fields are plain values, for worker processes."""
@@ -73,6 +85,8 @@ class EvalSetup:
     observe_age: bool = False  # what the policy observes beside its observation, likewise
     observe_actions: int = 0
     observe_step: bool = False
+    robots: int = 1  # that play an episode together
+    channel: SharedChannel | None = None  # that they share
 
     @property
     def is_remote(self) -> bool:
@@ -122,6 +136,8 @@ class EvalSetup:
         text = f"step {self.step}, observations of {self.sent_bytes:,} bytes"
         if (count := self.sent["observation_packets"]) > 1:
             text += f" in {count:,} packets ({self.delivery})"
+        if self.channel:
+            text += f", {self.robots} robots share {self.channel}"
         on_link = self.sent.get("on_link_ms")
         return text if on_link is None else f"{text}, {on_link:g} ms on the link"
 
@@ -132,6 +148,10 @@ class EvalSetup:
             told["policy"] = hash_of(sources(Path(self.policy)))
         told["link"] = _code_of_link(read_profile(self.link))
         told["compute"] = told.pop("times") or self.compute
+        if self.channel is None:
+            del told["robots"], told["channel"]
+        elif is_path(f"{self.channel.schedule}"):
+            told["schedule"] = hash_of(sources(Path(f"{self.channel.schedule}")))
         return json.loads(json.dumps(told))  # type: ignore[no-any-return]
 
 

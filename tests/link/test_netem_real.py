@@ -31,7 +31,8 @@ MINUTES = [
     (name, way)
     for name in names("profile")
     for way in ("uplink", "downlink")
-    if name != "lossy" and "-sa" not in name  # netem refuses these
+    if name != "lossy"
+    and "-sa" not in name  # netem refuses these
     and (way == "uplink" or load_profile(name).downlink != load_profile(name).uplink)
 ]
 """Directions of the shipped profiles; one direction if both are equal."""
