@@ -16,7 +16,7 @@ from cloudrc.link.draws import BLOCK, OVERTAKES, Fate, bit_flips, impairments, s
 from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
 
 if TYPE_CHECKING:
-    from cloudrc.link.radio import RadioParts, Schedule
+    from cloudrc.link.radio import RadioParts, Slots
 
 HEADER_BYTES = 28  # size of the IPv4 and UDP headers (RFC 791, RFC 768), also on the wire [bytes]
 _BYTE = b"\0"  # stands for the content of a packet
@@ -104,7 +104,7 @@ class LinkDirection:
             from cloudrc.link.opportunities import Opportunities  # here: few links need it
 
             self._opportunities = Opportunities(times_ns)
-        self._radio: Schedule | None = None
+        self._radio: Slots | None = None
         if profile.radio:
             from cloudrc.link.radio import schedule
 

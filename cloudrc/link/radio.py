@@ -44,7 +44,7 @@ class RadioSpan(NamedTuple):
     most: int  # no delay reaches it [ns]
 
 
-class Schedule:
+class Slots:
     """The slots of one direction of a radio.
 
     Attributes:
@@ -105,8 +105,8 @@ def mean_delay(profile: DirectionProfile, uplink: bool) -> float:
     return (found.span.mean + found.repeats_ns) * 1e-9
 
 
-schedule = lru_cache(maxsize=64)(Schedule)
-"""Make a `Schedule`; of equal arguments, the same."""
+schedule = lru_cache(maxsize=64)(Slots)
+"""Make `Slots`; of equal arguments, the same."""
 
 
 @lru_cache(maxsize=64)

@@ -13,7 +13,7 @@ _MASK = (1 << WINDOW) - 1
 USED, LATE, REPEATED = "used", "late", "repeated"
 
 
-class Channel:
+class ReceiveWindow:
     """Classifies datagrams of one kind and direction as used, late or repeated, in one session."""
 
     def __init__(self, newest_wins: bool) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from cloudrc.messages import Command, Datagram, Passed, Telemetry
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import Channel
+from cloudrc.tunnel.channel import ReceiveWindow
 from cloudrc.tunnel.codec import Direction, encode_command, encode_telemetry
 from cloudrc.tunnel.handshake import KEY_TEXT, VERSION_TEXT
 from cloudrc.tunnel.keys import KeyRing
@@ -42,7 +42,7 @@ class TunnelEnd:
         self._identity, self.counts = identity, counts
         self._session = Session(sends, identity.ring)
         self._make_datagram = self._session.pass_on if identity.passes else self._encode
-        self._channel = Channel(newest_wins)
+        self._channel = ReceiveWindow(newest_wins)
         self._told: set[str] = set()  # texts of the faults in this session
         self._clock_is_shared = False
         self._datagrams: list[Datagram] = []

@@ -23,7 +23,7 @@ from collections import deque
 from typing import NamedTuple
 
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import REPEATED, Channel
+from cloudrc.tunnel.channel import REPEATED, ReceiveWindow
 from cloudrc.tunnel.codec import Accept, DecodeError, Hello, Kind
 from cloudrc.tunnel.session import NO_EPOCH, Session
 
@@ -71,7 +71,7 @@ class ServerHandshake:
         self._challenged_ns = -CHALLENGE_NS
         self._counters: dict[bytes, int] = {}  # newest counter answered, by nonce
         self._windows = {
-            int(kind): Channel(newest_wins=True) for kind in (Kind.ALIVE, Kind.OPERATOR)
+            int(kind): ReceiveWindow(newest_wins=True) for kind in (Kind.ALIVE, Kind.OPERATOR)
         }
 
     def hear(self, now_ns: int) -> None:

@@ -12,7 +12,7 @@ from cloudrc.cloud.operator import EmergencyStopRepeater
 from cloudrc.messages import ZERO
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
-from cloudrc.tunnel.channel import LATE, USED, Channel
+from cloudrc.tunnel.channel import LATE, USED, ReceiveWindow
 from cloudrc.world.guard import limits
 from cloudrc.world.guard.hold import PositionHold
 from cloudrc.world.guard.state import Guard
@@ -73,8 +73,8 @@ def ignores(owner, name, value=lambda *_: None):
 
 
 def applies_late_commands(patch):
-    take = Channel.take
-    patch.setattr(Channel, "take", lambda *_: USED if (said := take(*_)) == LATE else said)
+    take = ReceiveWindow.take
+    patch.setattr(ReceiveWindow, "take", lambda *_: USED if (said := take(*_)) == LATE else said)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.tunnel.channel import LATE, REPEATED, USED, WINDOW, Channel
+from cloudrc.tunnel.channel import LATE, REPEATED, USED, WINDOW, ReceiveWindow
 
 
 def expected(counter, seen, newest_wins):
@@ -17,7 +17,7 @@ def expected(counter, seen, newest_wins):
 
 
 def compare(counters, newest_wins):
-    channel, seen = Channel(newest_wins), set[int]()
+    channel, seen = ReceiveWindow(newest_wins), set[int]()
     for counter in counters:
         assert channel.take(counter) == expected(counter, seen, newest_wins)
         seen.add(counter)
@@ -29,7 +29,7 @@ def test_the_window_ends_where_it_says(ahead):
 
 
 def test_a_plan_is_late_after_a_newer_command_in_any_order():
-    channel = Channel(newest_wins=False)
+    channel = ReceiveWindow(newest_wins=False)
     assert [channel.take(n, newest_wins=True) for n in (3, 2, 2, 4)] == [
         *("used", "late", "repeated", "used"),
     ]
@@ -43,7 +43,7 @@ def test_the_window_agrees_with_a_set(counters, newest_wins):
 
 
 def test_more_repeated_than_new_datagrams_are_a_flood():
-    channel = Channel(newest_wins=True)
+    channel = ReceiveWindow(newest_wins=True)
     flooded = []
     for counter in (0, 1, 0, 1, 0, 2, 2):  # a link that doubles everything, and more
         channel.take(counter)
