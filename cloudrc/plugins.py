@@ -21,7 +21,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points, packages_distributions, version
-from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -126,8 +125,9 @@ def describe(kind: str, name: str) -> str:
     A plug-in of cloudrc is read, not imported: an onboard controller would import MuJoCo.
     """
     module = _own_module(kind, name)
-    if module and (spec := find_spec(module)) is not None and spec.origin is not None:
-        return Path(spec.origin).read_text("utf-8").split('"""', 2)[1].partition("\n")[0]
+    if module:
+        file = Path(__file__).parent.joinpath(*module.split(".")[1:]).with_suffix(".py")
+        return file.read_text("utf-8").split('"""', 2)[1].partition("\n")[0]
     try:
         return find(kind, name).doc
     except CloudrcError as error:

@@ -110,7 +110,13 @@ def _check(name: str, ok: bool, found: str, fix: str, modes: tuple[str, ...] = (
 def all_checks(mode: str, options: Options) -> Iterator[Check]:
     """Yield the results of all checks; in mode "cluster" also check the cluster."""
     output = subprocess.PIPE
-    program = subprocess.Popen(interpreter("-c", PROGRAM), stdout=output, stderr=output, text=True)
+    program = subprocess.Popen(
+        interpreter("-c", PROGRAM),
+        stdout=output,
+        stderr=output,
+        text=True,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # numpy would start a thread per core
+    )
     yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
     yield from map(packages, EXTRAS)
     yield from _physics(program)
@@ -166,7 +172,8 @@ def _cores() -> Check:
 
 def _cluster(options: Options) -> Iterator[Check]:
     """Check whether a kubeconfig is valid and its cluster answers; survey it if asked for."""
-    from cloudrc.cluster.client import DEFAULT_RELEASE, connect
+    from cloudrc.cluster import DEFAULT_RELEASE
+    from cloudrc.cluster.client import connect
     from cloudrc.cluster.incidents import find_causes
     from cloudrc.cluster.survey import survey
 

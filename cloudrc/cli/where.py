@@ -25,7 +25,7 @@ from cloudrc.cli.parser import (
     number,
     whole_number,
 )
-from cloudrc.cluster.client import DEFAULT_RELEASE as DEFAULT_RELEASE
+from cloudrc.cluster import DEFAULT_RELEASE as DEFAULT_RELEASE
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.files import warn_if_readable
 from cloudrc.outside.paths import TOKEN_VARIABLE, read_token

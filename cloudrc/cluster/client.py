@@ -19,9 +19,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
+from cloudrc.cluster import DEFAULT_RELEASE
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError, to_one_line
 
-DEFAULT_RELEASE = "cloudrc"
 COMPONENTS = ("world", "cloud")
 """Components of a release that have a pod of their own."""
 REQUEST_TIMEOUT = 15.0

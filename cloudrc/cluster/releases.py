@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from cloudrc.cluster import DEFAULT_RELEASE
 from cloudrc.cluster.client import (
-    DEFAULT_RELEASE,
     ClusterError,
     Release,
     connect,

@@ -19,7 +19,8 @@ import numpy as np
 from cloudrc.messages import GuardState
 from cloudrc.metrics.age import describe
 from cloudrc.metrics.control import ages_at_actuator
-from cloudrc.metrics.flight import Array, Columns, Flight, add_metrics, select
+from cloudrc.metrics.descriptions import AGE_STAGES
+from cloudrc.metrics.flight import Array, Columns, Flight, add_measures, select
 from cloudrc.record.columns import Column, datagrams, join
 from cloudrc.records import UNSENT
 
@@ -100,23 +101,30 @@ class Stage(NamedTuple):
     is_extra: bool = False  # whether most flights do not have it
 
 
+def _stage(
+    name: str,
+    end: Callable[[Commands], Array],
+    *,
+    at_cloud: bool = False,
+    is_extra: bool = False,
+) -> Stage:
+    return Stage(name, AGE_STAGES[name], end, at_cloud, is_extra)
+
+
 STAGES = (
-    Stage("observation", "odometry waits for its datagram",
-          lambda c: c.at("/telemetry", c.telemetry)),
-    Stage("uplink_cell", "telemetry passes the cell", lambda c: c.behind_cell(
+    _stage("observation", lambda c: c.at("/telemetry", c.telemetry)),
+    _stage("uplink_cell", lambda c: c.behind_cell(
         c.telemetry, c.at("/telemetry", c.telemetry), uplink=True), is_extra=True),
-    Stage("uplink", "uplink", lambda c: c.at("/uplink_delay", c.telemetry), at_cloud=True),
-    Stage("queue", "telemetry waits for cloud's period",
-          lambda c: c.at("/delay_estimate", c.numbers), at_cloud=True),
-    Stage("compute", "cloud computes", lambda c: c.at("/left", c.numbers),
-          at_cloud=True, is_extra=True),
-    Stage("downlink_cell", "command passes the cell", lambda c: c.behind_cell(
+    _stage("uplink", lambda c: c.at("/uplink_delay", c.telemetry), at_cloud=True),
+    _stage("queue", lambda c: c.at("/delay_estimate", c.numbers), at_cloud=True),
+    _stage("compute", lambda c: c.at("/left", c.numbers), at_cloud=True, is_extra=True),
+    _stage("downlink_cell", lambda c: c.behind_cell(
         c.numbers, c.left_ns, uplink=False), at_cloud=True, is_extra=True),
-    Stage("downlink", "downlink", lambda c: c.at("/downlink_delay", c.numbers)),
-    Stage("wait", "command waits for the step", lambda c: c.at("/command_applied", c.numbers)),
+    _stage("downlink", lambda c: c.at("/downlink_delay", c.numbers)),
+    _stage("wait", lambda c: c.at("/command_applied", c.numbers)),
 )  # fmt: skip
-"""All stages of a command, in their order. A further one is a row: what it is called, and when it
-ends."""
+"""All stages of a command, in their order. A further one is a row here, with its words in
+`AGE_STAGES`."""
 NUMBER = "budget_"
 """Begin of the names of the metrics; the name of a stage follows."""
 NEEDED = (
@@ -296,8 +304,4 @@ def _mean(name: str, flight: Flight) -> float | None:
     return None
 
 
-add_metrics(
-    "Link and loop",
-    *((f"{NUMBER}{stage.name}", "s", f"Mean of a stage of the age: {stage.text}. Of the commands "
-       "that the robot followed.", partial(_mean, stage.name)) for stage in STAGES),
-)  # fmt: skip
+add_measures(*((f"{NUMBER}{stage.name}", partial(_mean, stage.name)) for stage in STAGES))

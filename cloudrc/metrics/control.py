@@ -23,7 +23,7 @@ from cloudrc.metrics.flight import (
     Array,
     Columns,
     Flight,
-    add_metrics,
+    add_measures,
     finite,
     mean,
     rms,
@@ -238,62 +238,30 @@ def _missed_periods(flight: Flight) -> float | None:
     return flight.growth("missed_periods") or 0.0
 
 
-add_metrics(
-    "Link and loop",
-    ("rtt_mean", "s", "Mean round trip from command to echo, without the hold time in world.",
-     lambda flight: round_trips(flight)["rtt"], "mean"),
-    ("rtt_p95", "s", "Round trip from command to echo, without the hold time in world: 95th "
-     "percentile.", lambda flight: round_trips(flight)["rtt"], "p95"),
-    ("loop_delay_mean", "s", "Mean round trip from command to echo, with the hold time in world; "
-     "each command counts once.", lambda flight: round_trips(flight)["loop_delay"], "mean"),
-    ("delay_sample_mean", "s", "Mean of the estimator's delay samples, one per telemetry that "
-     "cloud used: the paper's tau_n, which eq. (1) averages.", delay_samples, "mean"),
-    ("age_of_information_mean", "s", "Mean age of cloud's newest odometry when it computes a "
-     "command.", _age_of_information),
-    ("age_at_actuator_mean", "s", "Mean age of information at the actuator: of the odometry behind "
-     "the command that the robot follows.", partial(_age, "mean")),
-    ("age_at_actuator_p99", "s", "Age of information at the actuator: in 99 % of the time, it is "
-     "lower.", partial(_age, "p99")),
-    ("age_at_actuator_max", "s", "Largest age of information at the actuator.",
-     partial(_age, "max")),
-    ("peak_age_mean", "s", "Mean peak age: age of information at the actuator just before each "
-     "command that lowers it.", partial(_age, "peak_mean")),
-    ("age_violation", "1", "Share of the time with a command in use whose age of information is "
-     "above criteria.age_deadline_s.", partial(_age, "violation")),
-    ("misses_in_10", "1", "Of any 10 successive command periods, the most that began in HOLD or "
-     "with an age of information above criteria.age_deadline_s.", _most_missed),
-    ("commands_applied", "1", "Number of commands that reached the low-level controller.",
-     lambda flight: flight.count(len(flight.during("/command_applied")["epoch"]))),
-    ("commands_withheld", "1", "Number of commands that cloud did not send, because their plan was "
-     "no news (cloud.send_delta_mps) or the controller returned None.",
-     lambda flight: flight.growth("commands_withheld")),
-    rtt_mean="round trip, mean",
-)  # fmt: skip
-add_metrics(
-    "Estimation and tracking",
-    ("prediction_error_rms", "m", "RMS distance from the predicted to the true position when each "
-     "command was applied, or while the robot followed its plan.",
-     lambda flight: prediction_errors(flight)[0]),
-    ("estimate_error_rms", "m", "RMS distance from the predicted to the true position at the "
-     "instant of the prediction.", lambda flight: estimate_errors(flight)[0]),
-    ("delay_estimate_error_rms", "s", "RMS difference between the horizon and the true delay from "
-     "odometry to applied command, from the first echo on; without plans only.", _delay_error),
-    prediction_error_rms="prediction error, RMS",
-)  # fmt: skip
-add_metrics(
-    "Real time",
-    ("world_lateness_p99", "s", "Lateness of world's wakes: 99th percentile; real time only.",
-     lambda flight: wakes(flight, "world")["lateness"], "p99"),
-    ("cloud_lateness_p99", "s", "Lateness of cloud's wakes: 99th percentile; real time only.",
-     lambda flight: wakes(flight, "cloud")["lateness"], "p99"),
-    ("world_slip", "s", "Time by which world's clock fell behind the machine's clock because "
-     "the simulation was late.", _slip),
-    ("real_time_factor", "1", "Simulated time divided by time on the machine's clock; real time "
-     "only.", _real_time_factor),
-    ("missed_periods", "1", "Number of periods without a command because cloud was late; "
-     "real time only.", _missed_periods),
-    ("controller_gaps", "1", "Number of times that the program of cloud.controller remote was "
-     "silent for 0.2 s, so that the robot stood still.",
-     lambda flight: flight.growth("controller_gaps")),
-    real_time_factor="real-time factor",
-)  # fmt: skip
+add_measures(
+    ("rtt_mean", lambda flight: round_trips(flight)["rtt"], "mean"),
+    ("rtt_p95", lambda flight: round_trips(flight)["rtt"], "p95"),
+    ("loop_delay_mean", lambda flight: round_trips(flight)["loop_delay"], "mean"),
+    ("delay_sample_mean", delay_samples, "mean"),
+    ("age_of_information_mean", _age_of_information),
+    ("age_at_actuator_mean", partial(_age, "mean")),
+    ("age_at_actuator_p99", partial(_age, "p99")),
+    ("age_at_actuator_max", partial(_age, "max")),
+    ("peak_age_mean", partial(_age, "peak_mean")),
+    ("age_violation", partial(_age, "violation")),
+    ("misses_in_10", _most_missed),
+    (
+        "commands_applied",
+        lambda flight: flight.count(len(flight.during("/command_applied")["epoch"])),
+    ),
+    ("commands_withheld", lambda flight: flight.growth("commands_withheld")),
+    ("prediction_error_rms", lambda flight: prediction_errors(flight)[0]),
+    ("estimate_error_rms", lambda flight: estimate_errors(flight)[0]),
+    ("delay_estimate_error_rms", _delay_error),
+    ("world_lateness_p99", lambda flight: wakes(flight, "world")["lateness"], "p99"),
+    ("cloud_lateness_p99", lambda flight: wakes(flight, "cloud")["lateness"], "p99"),
+    ("world_slip", _slip),
+    ("real_time_factor", _real_time_factor),
+    ("missed_periods", _missed_periods),
+    ("controller_gaps", lambda flight: flight.growth("controller_gaps")),
+)

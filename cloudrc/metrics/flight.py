@@ -25,6 +25,7 @@ from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
 from cloudrc.metrics.counters import growth
 from cloudrc.metrics.definitions import QUANTITIES, RecordQuantity
+from cloudrc.metrics.descriptions import DESCRIPTIONS
 from cloudrc.record.columns import Recording, Table, datagrams, join
 from cloudrc.record.holes import Hole
 from cloudrc.record.topics import BY_SOURCE
@@ -283,16 +284,16 @@ SHIPPED: dict[str, Metric] = {}
 """The metrics of cloudrc by name; complete once `cloudrc.metrics.measure` is imported."""
 
 
-def add_metrics(group: str, *rows: tuple[Any, ...], **labels: str) -> None:
-    """Add metrics of cloudrc to a group; each row has name, unit, meaning and function.
+def add_measures(*rows: tuple[Any, ...]) -> None:
+    """Add metrics of cloudrc; each row has a name of `DESCRIPTIONS` and a function.
 
     A row may also name a key of `STATISTICS`: its function then returns an array of a flight.
-    `labels` are the labels of those that the summary of a report shows.
     """
-    for name, unit, meaning, measure, *statistic in rows:
+    for name, measure, *statistic in rows:
         if statistic:
             measure = partial(_summarize, measure, *statistic)
-        SHIPPED[name] = Metric(name, unit, meaning, measure, group, labels.get(name, ""))
+        unit, meaning, group, label = DESCRIPTIONS[name]
+        SHIPPED[name] = Metric(name, unit, meaning, measure, group, label)
 
 
 def _summarize(values: Callable[[Flight], Array], statistic: str, flight: Flight) -> float | None:
@@ -306,8 +307,7 @@ def add_quantities() -> None:
     """Add the metrics of `QUANTITIES`."""
     for each in QUANTITIES:
         if each.name:
-            row = each.name, each.unit, each.meaning, partial(_values, each), each.statistic
-            add_metrics(each.group, row, **{each.name: each.label})
+            add_measures((each.name, partial(_values, each), each.statistic))
 
 
 def _values(quantity: RecordQuantity, flight: Flight) -> Array:
@@ -370,20 +370,10 @@ def _distance(flight: Flight) -> float | None:
     return float(np.linalg.norm(steps, axis=1).sum()) if len(steps) else None
 
 
-add_metrics(
-    "Mission",
-    ("duration", "s", "Time from the start of the mission to its end.",
-     lambda flight: flight.count(flight.duration)),
-    ("start_delay", "s", "Time from the start of the mission until the robot followed its first "
-     "command.", lambda flight: flight.start_ns and float(flight.seconds(flight.start_ns))),
-    ("distance_flown", "m", "Length of the path that the robot's base flew.", _distance),
-    duration="mission took",
-)  # fmt: skip
-add_metrics(
-    "Distance to obstacles",
-    ("min_clearance", "m", "Smallest distance between the robot and an obstacle while the base "
-     "is inside a tube.", partial(_least_clearance, inside=True)),
-    ("min_clearance_flight", "m", "Smallest distance between the robot and an obstacle during the "
-     "whole flight.", partial(_least_clearance, inside=False)),
-    min_clearance="least clearance",
-)  # fmt: skip
+add_measures(
+    ("duration", lambda flight: flight.count(flight.duration)),
+    ("start_delay", lambda flight: flight.start_ns and float(flight.seconds(flight.start_ns))),
+    ("distance_flown", _distance),
+    ("min_clearance", partial(_least_clearance, inside=True)),
+    ("min_clearance_flight", partial(_least_clearance, inside=False)),
+)

@@ -12,12 +12,11 @@ from functools import partial
 import numpy as np
 
 from cloudrc.metrics.counters import growth
-from cloudrc.metrics.flight import Array, Flight, add_metrics, select
+from cloudrc.metrics.descriptions import RELAY_COUNTS, RELEASE_ERRORS, WAYS
+from cloudrc.metrics.flight import Array, Flight, add_measures, select
 from cloudrc.record.columns import Recording, datagrams, join
 from cloudrc.records import UNSENT
 
-WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
-"""Direction -> words for the direction in the description of a metric."""
 SENT = {"uplink": "/telemetry", "downlink": "/delay_estimate"}
 """Direction -> topic with one row for each datagram that is sent in this direction."""
 SENDER = {"uplink": "world", "downlink": "cloud"}
@@ -25,13 +24,6 @@ SENDER = {"uplink": "world", "downlink": "cloud"}
 WINDOW_MAX = 1024
 """A missing datagram counts as lost after this number of newer datagrams; the receiver accepts
 no older one, whether it is new or repeated (`cloudrc.tunnel.channel.WINDOW`)."""
-PERCENTILES = {"p50": "median", "p99": "99th percentile", "p999": "99.9th percentile"}
-COUNTS = {
-    "relay_overflow": "that the relay dropped because its queue was full.",
-    # The release errors do not include this time.
-    "relay_stalled": "that waited 50 ms or more until the relay read them.",
-    "released_early": "that left before they were due; above 0 the relay has a bug.",
-}
 
 
 def _late(flight: Flight, way: str) -> float | None:
@@ -91,34 +83,30 @@ def _sent(flight: Flight, way: str, name: str) -> float | None:
     return growth(flight.recording, name, flight.span_ns, end=SENDER[way], steady=True)
 
 
-def _add_direction(way: str, words: str) -> None:
-    """Add the metrics of the direction `way`; `words` name the direction in descriptions."""
-
-    def seconds(name: str, flight: Flight) -> float | None:
-        count = flight.recording["/count"]
-        totals = count["total"][count["name"] == f"{way}_release_error_{name}_ns"]
-        return float(totals[-1]) * 1e-9 if len(totals) else None
-
-    add_metrics(
-        "Link and loop",
-        (f"{way}_delay_mean", "s", f"Mean one-way delay {words} of all datagrams that arrived, "
-         "late ones included.", lambda flight: flight.during(f"/{way}_delay")["delay"], "mean"),
-        (f"packets_sent_{way}", "1", f"Number of datagrams sent {words} in the flight.",
-         partial(_sent, way=way, name="sent")),
-        (f"bytes_sent_{way}", "B", f"UDP payload of the datagrams sent {words} in the flight.",
-         partial(_sent, way=way, name="sent_bytes")),
-        (f"late_{way}", "1", f"Share of the arrived datagrams {words} that were too late to be "
-         "used.", partial(_late, way=way)),
-        (f"loss_{way}", "1", f"Share of the datagrams {words} that never arrived.",
-         partial(loss, way=way)),
-        *((f"release_error_{name}_{way}", "s", f"Delay with which the relay released datagrams "
-           f"{words} after they were due: {which}, since the link came up.", partial(seconds, name))
-          for name, which in PERCENTILES.items()),
-        *((f"{name}_{way}", "1", f"Datagrams {words} {which}", partial(
-            Flight.growth, name=f"{way}_{name.removeprefix('relay_')}"))
-          for name, which in COUNTS.items()),
-    )  # fmt: skip
+def _release_error(flight: Flight, way: str, name: str) -> float | None:
+    """Return the last total of the relay's release error `name`, such as "p99" [s]."""
+    count = flight.recording["/count"]
+    totals = count["total"][count["name"] == f"{way}_release_error_{name}_ns"]
+    return float(totals[-1]) * 1e-9 if len(totals) else None
 
 
-for _way, _words in WAYS.items():
-    _add_direction(_way, _words)
+def _delays(flight: Flight, way: str) -> Array:
+    return flight.during(f"/{way}_delay")["delay"]
+
+
+for _way in WAYS:
+    add_measures(
+        (f"{_way}_delay_mean", partial(_delays, way=_way), "mean"),
+        (f"packets_sent_{_way}", partial(_sent, way=_way, name="sent")),
+        (f"bytes_sent_{_way}", partial(_sent, way=_way, name="sent_bytes")),
+        (f"late_{_way}", partial(_late, way=_way)),
+        (f"loss_{_way}", partial(loss, way=_way)),
+        *(
+            (f"release_error_{name}_{_way}", partial(_release_error, way=_way, name=name))
+            for name in RELEASE_ERRORS
+        ),
+        *(
+            (f"{name}_{_way}", partial(Flight.growth, name=f"{_way}_{name.removeprefix('relay_')}"))
+            for name in RELAY_COUNTS
+        ),
+    )

@@ -15,7 +15,7 @@ from cloudrc.metrics.definitions import Holds
 from cloudrc.metrics.flight import (
     Array,
     Flight,
-    add_metrics,
+    add_measures,
     between,
     finite,
     mean,
@@ -302,51 +302,35 @@ def _rotor_energy(flight: Flight) -> float | None:
     return float(end - begin)
 
 
-add_metrics(
-    "Mission",
-    ("waypoints_reached", "1", "Number of waypoints at which the true position stayed within the "
-     "tolerance, plus 3 times the position noise, for the dwell time on the operator's clock, "
-     "and likewise the true yaw if the waypoint has a yaw_deg. The last row of a "
-     "file of setpoints counts as one.", _waypoints_reached),
-    ("yaw_error", "rad", "Largest difference between the yaw_deg of a waypoint and the true yaw "
-     "when the waypoint was reached.", _yaw_error),
-    ("final_error", "m", "Distance from the last setpoint of a file to the true position when the "
-     "mission ended.", _final_error),
-    ("obstacle_contacts", "1", "Number of contacts with obstacles. These are all bodies but the "
-     "floor and the body that the mission has to touch.",
-     lambda flight: flight.count(len(obstacle_contacts(flight)["body"]))),
-    ("contact_time", "s", "Time from the start of the mission to the first touch of what it has "
-     "to touch.", lambda flight: flight.first_touch and float(
-         flight.seconds(flight.first_touch["stamp_ns"]))),
-    ("touch_speed", "m/s", "Speed of the probe (without one: of the base) just before this touch.",
-     lambda flight: flight.first_touch and float(
-         np.linalg.norm(flight.first_touch["touch_velocity"]))),
-    ("peak_contact_force", "N", "Largest force on the probe in any physics step.", _peak_force),
-    ("contact_impulse", "N s", "Force on the probe times time, over the first 0.1 s of the "
-     "first touch.", _impulse),
-    ("steady_contact_force", "N", "Mean force on the probe over the last 2 s of the mission.",
-     _steady_force),
-    *((f"steady_error_{name}", "m", f"Mean distance from the setpoint along {name} over the last "
-       "5 s of a hover.", partial(_steady_error, axis=axis)) for axis, name in enumerate("xyz")),
-    ("rotor_energy", "J", "Mechanical energy of the rotors in the flight, from their thrusts and "
-     "speeds.", _rotor_energy),
-    ("cross_track_rms", "m", "RMS distance from the true path of the base to the straight lines "
-     "from its start through the waypoints, until the first touch.", _cross_track),
-    waypoints_reached="waypoints reached",
-    final_error="from the last setpoint, at the end",
-    contact_time="first touch at",
-    touch_speed="speed at the first touch",
-    steady_contact_force="steady contact force",
-)  # fmt: skip
-add_metrics(
-    "Guard and faults",
-    ("hold_count", "1", "Number of times that the guard went to HOLD because fresh commands were "
-     "missing.", lambda flight: flight.count(len(holds(flight)))),
-    ("hold_time", "s", "Total time in HOLD, in which the guard flies without commands.",
-     lambda flight: flight.count(sum(end - begin for begin, end in holds(flight)) * 1e-9)),
-    ("fault_count", "1", "Number of faults that did not stop the flight: each failed call of a "
-     "plug-in in the flight, and each other fault once.", _fault_count),
-    ("recorder_dropped", "1", "Number of records that the recorder dropped, since it started, "
-     "because the loop must not wait for a disk.", _recorder_dropped),
-    hold_count="times in HOLD",
-)  # fmt: skip
+add_measures(
+    ("waypoints_reached", _waypoints_reached),
+    ("yaw_error", _yaw_error),
+    ("final_error", _final_error),
+    ("obstacle_contacts", lambda flight: flight.count(len(obstacle_contacts(flight)["body"]))),
+    (
+        "contact_time",
+        lambda flight: flight.first_touch and float(flight.seconds(flight.first_touch["stamp_ns"])),
+    ),
+    (
+        "touch_speed",
+        lambda flight: (
+            flight.first_touch and float(np.linalg.norm(flight.first_touch["touch_velocity"]))
+        ),
+    ),
+    ("peak_contact_force", _peak_force),
+    ("contact_impulse", _impulse),
+    ("steady_contact_force", _steady_force),
+    *(
+        (f"steady_error_{name}", partial(_steady_error, axis=axis))
+        for axis, name in enumerate("xyz")
+    ),
+    ("rotor_energy", _rotor_energy),
+    ("cross_track_rms", _cross_track),
+    ("hold_count", lambda flight: flight.count(len(holds(flight)))),
+    (
+        "hold_time",
+        lambda flight: flight.count(sum(end - begin for begin, end in holds(flight)) * 1e-9),
+    ),
+    ("fault_count", _fault_count),
+    ("recorder_dropped", _recorder_dropped),
+)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cloudrc.metrics.control import tracking_errors
-from cloudrc.metrics.flight import Array, Flight, add_metrics, between, mean
+from cloudrc.metrics.flight import Array, Flight, add_measures, between, mean
 from cloudrc.rounding import differences, exceeds
 
 SHORTEST_NS = 500_000_000
@@ -202,35 +202,23 @@ def _control_cost(flight: Flight) -> float | None:
     return _integral(squares[known], times) if known.any() else None
 
 
-add_metrics(
-    "Steps",
-    ("overshoot_mean", "1", "Mean overshoot of the steps, as a share of the step.",
-     partial(_mean_of, name="overshoot")),
-    ("overshoot_max", "1", "Largest overshoot of a step, as a share of the step.",
-     lambda flight: max((step.overshoot for step in steps(flight)), default=None)),
-    ("rise_time_mean", "s", "Mean time from 10 % to 90 % of a step.",
-     partial(_mean_of, name="rise_time")),
-    ("settling_time_mean", "s", "Mean time until the error stays within 5 % of the step, over the "
-     "steps that settled; unsettled_steps counts the others.",
-     partial(_mean_of, name="settling_time")),
-    ("unsettled_steps", "1", "Number of steps, flown to their end, whose error does not stay "
-     "within 5 % of the step.",
-     lambda flight: flight.count(sum(step.is_unsettled for step in steps(flight)))),
-    ("iae_mean", "m s", "Integral of the error over time, mean of the steps.",
-     partial(_mean_of, name="iae")),
-    ("ise_mean", "m^2 s", "Integral of the squared error over time, mean of the steps.",
-     partial(_mean_of, name="ise")),
-    ("squared_command_integral_mean", "m^2/s", "Integral of the squared commanded velocity over "
-     "time, mean of the steps.", partial(_mean_of, name="squared_command")),
-    ("unstable_steps", "1", "Number of steps in which the error oscillates without decay.",
-     lambda flight: flight.count(sum(step.unstable for step in responses(flight)))),
-)  # fmt: skip
-add_metrics(
-    "Estimation and tracking",
-    ("tracking_error_p95", "m", "Distance from setpoint to true position: 95th percentile.",
-     _tracking_errors, "p95"),
-    ("tracking_error_peak", "m", "Largest distance from the setpoint to the true position.",
-     _tracking_errors, "max"),
-    ("control_cost", "m^2 s", "Cost of control J: integral over the mission of the squared "
-     "distance from the setpoint to the true position.", _control_cost),
-)  # fmt: skip
+add_measures(
+    ("overshoot_mean", partial(_mean_of, name="overshoot")),
+    ("overshoot_max", lambda flight: max((step.overshoot for step in steps(flight)), default=None)),
+    ("rise_time_mean", partial(_mean_of, name="rise_time")),
+    ("settling_time_mean", partial(_mean_of, name="settling_time")),
+    (
+        "unsettled_steps",
+        lambda flight: flight.count(sum(step.is_unsettled for step in steps(flight))),
+    ),
+    ("iae_mean", partial(_mean_of, name="iae")),
+    ("ise_mean", partial(_mean_of, name="ise")),
+    ("squared_command_integral_mean", partial(_mean_of, name="squared_command")),
+    (
+        "unstable_steps",
+        lambda flight: flight.count(sum(step.unstable for step in responses(flight))),
+    ),
+    ("tracking_error_p95", _tracking_errors, "p95"),
+    ("tracking_error_peak", _tracking_errors, "max"),
+    ("control_cost", _control_cost),
+)

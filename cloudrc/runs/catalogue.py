@@ -28,9 +28,9 @@ def describe_all(kind: str) -> dict[str, str]:
     if kind in PLUGINS:
         lines = {name: plugins.describe(kind, name) for name in plugins.names(kind)}
         if kind == "metrics":
-            from cloudrc.metrics.measure import SHIPPED
+            from cloudrc.metrics.descriptions import DESCRIPTIONS
 
-            lines |= {metric.name: metric.meaning for metric in SHIPPED.values()}
+            lines |= {metric: about.meaning for metric, about in DESCRIPTIONS.items()}
         elif kind == "onboard":
             lines |= _onboard_of_robots()
     else:

@@ -330,6 +330,7 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
     resting = {f"steady_error_{axis}" for axis in "xyz"}
     others = {"recorder_dropped", "final_error", "controller_gaps", "yaw_error", "age_violation"}
     others |= {"commands_withheld"}
+    others |= {f"budget_{name}" for name in ("uplink_cell", "compute", "downlink_cell")}
     assert set(SHIPPED) - set(numbers) == REAL_TIME | OF_RELAYS | resting | others
     for name, number in numbers.items():
         assert set(number.unit) <= set("smNJB12^/ "), name
