@@ -17,7 +17,8 @@ from prometheus_client import CollectorRegistry, ProcessCollector, generate_late
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric as Family
 
-from cloudrc.drivers.servers import TEXT, HttpHandler, ThreadedServer
+from cloudrc.drivers.http import TEXT, HttpHandler
+from cloudrc.drivers.servers import ThreadedServer
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.exposition.live import CellMetrics, LinkMetrics, LiveMetrics
 from cloudrc.exposition.parts import Histogram, Readings, samples

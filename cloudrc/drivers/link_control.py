@@ -11,7 +11,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from cloudrc.drivers.servers import HttpHandler, ThreadedServer
+from cloudrc.drivers.http import HttpHandler
+from cloudrc.drivers.servers import ThreadedServer
 from cloudrc.errors import CloudrcError
 from cloudrc.link.control import APPLY_LIMIT, OK, REFUSED, read_answer
 from cloudrc.link.state import LinkState, to_text

@@ -6,11 +6,8 @@ from __future__ import annotations
 
 import socketserver
 import threading
-from http.server import BaseHTTPRequestHandler
 from typing import Any
 
-TEXT = "text/plain; charset=utf-8"
-"""Content type of a text."""
 LOOK_PERIOD = 0.1
 """Time between two looks whether the server has to end [s]."""
 
@@ -34,19 +31,3 @@ class ThreadedServer(socketserver.ThreadingMixIn, socketserver.BaseServer):
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore the errors of clients that disconnect early."""
-
-
-class HttpHandler(BaseHTTPRequestHandler):
-    """Answers one HTTP request and closes the connection."""
-
-    def answer(self, status: int, text: str, kind: str = TEXT) -> None:
-        """Send an answer; `kind` is its content type."""
-        content = text.encode()
-        self.send_response(status)
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        self.wfile.write(content)
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing, because requests arrive every few seconds."""
