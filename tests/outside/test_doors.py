@@ -57,6 +57,10 @@ def test_a_flag_reads_what_the_table_says(name):
 
 
 NEED_ANOTHER = {"compute_deviation_ms", "cpu_share", "send_delta_mps", "cores", "only"}
+NEED_ANOTHER |= {
+    "slot_ms",
+    "request_ms",
+}  # of a radio: the one is a multiple of the other's pattern
 
 
 def keys(model):
