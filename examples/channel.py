@@ -165,10 +165,10 @@ def rows() -> list[Row]:
         ("error of a model", nan, choose),
     ):
         name = "sum of x², 2 dead-beat loops, a = 1.1, 1.4"
-        found.append(Row(name, schedule, exact, partial(dead_beat, PLANTS, own), 2_000))
+        found.append(Row(name, schedule, exact, partial(dead_beat, PLANTS, own), 10_000))
     for schedule in ("round_robin", "largest_error"):
         name = "sum of x², 2 loops that hold u = -.4 x, -.6 x"
-        found.append(Row(name, schedule, nan, partial(held, (0.4, 0.6), schedule), 2_000))
+        found.append(Row(name, schedule, nan, partial(held, (0.4, 0.6), schedule), 10_000))
     return found
 
 
