@@ -222,13 +222,15 @@ class CloudEndpoint(TunnelEnd):
         """Return when cloud has to send a computed command or to compute the next command [ns]."""
         if self._unsent is not None:
             return self._unsent[0]
-        return min(self._tick_ns, self._due_ns) if self._answers else self._tick_ns
+        if self._on_arrival and self._can_answer:
+            return min(self._tick_ns, self._due_ns)
+        return self._tick_ns
 
     @property
-    def _answers(self) -> bool:
-        """Whether cloud answers newer telemetry on its arrival, and can do it now."""
-        can = self._loop.ready and self._setpoint is not None and self._session.epoch != NO_EPOCH
-        return self._on_arrival and can
+    def _can_answer(self) -> bool:
+        """Whether cloud has what it needs for a command."""
+        has_session = self._session.epoch != NO_EPOCH
+        return self._loop.ready and self._setpoint is not None and has_session
 
     def finish(self, now_ns: int) -> None:
         """Let the computation of the present command end at `now_ns` [ns]."""
@@ -296,8 +298,9 @@ class CloudEndpoint(TunnelEnd):
             self._send(Kind.ALIVE, b"")
 
     def _answer_if_due(self, now_ns: int) -> None:
-        """Send a command, if answers to telemetry are wanted and one is due."""
-        if self._answers and now_ns >= self._due_ns and self._setpoint is not None:
+        """Send a command, if cloud answers telemetry on its arrival and one is due."""
+        is_due = self._on_arrival and self._can_answer and now_ns >= self._due_ns
+        if is_due and self._setpoint is not None:
             self._due_ns = now_ns + SILENT_PERIODS * self._period_ns // 2
             self._send_command(self._setpoint, now_ns)
 
@@ -413,7 +416,9 @@ class CloudEndpoint(TunnelEnd):
             self._loop.expect((now_ns - self._start[1]) * 1e-9)
             self._start = None
         self._loop.observe(telemetry, now_ns)
-        self._due_ns = min(self._due_ns, max(now_ns, self._commanded_ns + self._period_ns // 2))
+        if self._on_arrival:
+            soonest_ns = max(now_ns, self._commanded_ns + self._period_ns // 2)
+            self._due_ns = min(self._due_ns, soonest_ns)
         if (followed := self._loop.plans.look_up(telemetry, now_ns)) is not None:
             self._records.append(followed)
         self._asked = max(self._asked, telemetry.mission)
