@@ -86,33 +86,33 @@ def told(rows: Sequence[dict[str, Any]], number: str, unit: float) -> str:
     return f"{median(values):.1f} [{low:.1f}, {high:.1f}]"
 
 
+def by(rows: Sequence[dict[str, Any]], key: str) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of each value that a key of their points has."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        found.setdefault(row["point"][key], []).append(row)
+    return found
+
+
 def predictors(rows: Sequence[dict[str, Any]]) -> str:
     """Return the table of prediction errors: predictors x links."""
-    links, names = (
-        dict.fromkeys(row["point"][key] for row in rows) for key in ("link", "predictor")
-    )
 
     def cells() -> Iterator[list[str]]:
-        for name in names:
-            mine = [row for row in rows if row["point"]["predictor"] == name]
-            parts = [[row for row in mine if row["point"]["link"] == link] for link in links]
-            yield [f"`{name}`", *(told(part, ERROR, 1e-3) for part in parts)]
+        for name, mine in by(rows, "predictor").items():
+            yield [f"`{name}`", *(told(part, ERROR, 1e-3) for part in by(mine, "link").values())]
 
-    return table(" | ".join(["predictor", *links]), cells())
+    return table(" | ".join(["predictor", *by(rows, "link")]), cells())
 
 
 def remedies(rows: Sequence[dict[str, Any]]) -> str:
     """Return the table of ages and prediction errors: links x predictors."""
-    links, names = (
-        dict.fromkeys(row["point"][key] for row in rows) for key in ("link", "predictor")
-    )
+    names = by(rows, "predictor")
 
     def cells() -> Iterator[list[str]]:
-        for link in links:
-            mine = [row for row in rows if row["point"]["link"] == link]
-            parts = [[row for row in mine if row["point"]["predictor"] == name] for name in names]
-            ages = [row for row in mine if row["point"]["predictor"] == "last_sample"]
-            yield [link, told(ages, AGE, 1e-3), *(told(part, ERROR, 1e-3) for part in parts)]
+        for link, mine in by(rows, "link").items():
+            parts = by(mine, "predictor")
+            errors = [told(parts[name], ERROR, 1e-3) for name in names]
+            yield [link, told(parts["last_sample"], AGE, 1e-3), *errors]
 
     columns = ["link", "mean age at the robot [ms]", *(f"error, `{name}` [mm]" for name in names)]
     return table(" | ".join(columns), cells())
