@@ -78,12 +78,8 @@ _add(
     ("contact_impulse", "N s", "Force on the probe times time, over the first 0.1 s of the first "
      "touch."),
     ("steady_contact_force", "N", "Mean force on the probe over the last 2 s of the mission."),
-    ("steady_error_x", "m", "Mean distance from the setpoint along x over the last 5 s of a "
-     "hover."),
-    ("steady_error_y", "m", "Mean distance from the setpoint along y over the last 5 s of a "
-     "hover."),
-    ("steady_error_z", "m", "Mean distance from the setpoint along z over the last 5 s of a "
-     "hover."),
+    *((f"steady_error_{axis}", "m", f"Mean distance from the setpoint along {axis} over the last "
+       "5 s of a hover.") for axis in "xyz"),
     ("rotor_energy", "J", "Mechanical energy of the rotors in the flight, from their thrusts and "
      "speeds."),
     ("cross_track_rms", "m", "RMS distance from the true path of the base to the straight lines "
