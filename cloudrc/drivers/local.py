@@ -364,7 +364,8 @@ class LocalRun:
 
     def _start(self, folder: Path, name: str, *words: str, **options: object) -> None:
         options["config"] = folder / "config.yaml"
-        options |= {"metrics": self._metrics[name]} if name in self._metrics else {}
+        if name in self._metrics:
+            options["metrics"] = self._metrics[name]
         log = folder / f"{name}.log"
         with log.open("ab") as errors:
             process = start_process([*words, "--feed"], options, subprocess.PIPE, errors)
