@@ -17,7 +17,7 @@ from cloudrc.outside.refusal import check_names
 from cloudrc.outside.values import Quantity, to_arrays
 from cloudrc.plugins import Found, find, is_path
 
-KIND = 134
+KIND = 135
 """Kind of the random numbers with which `random` chooses."""
 
 
@@ -142,7 +142,7 @@ def find_schedule(given: str | Path | Choose) -> Schedule:
     """Return a schedule by its name, from a file with `choose(waiting)`, or of such a function.
 
     Raises:
-        BadInputError: If there is none.
+        cloudrc.errors.CloudrcError: If there is none.
     """
     if callable(given):
         return _Function(given)
