@@ -36,8 +36,8 @@ class Answers:
     def __init__(self) -> None:
         """Begin an episode."""
         self._observations: dict[int, list[int]] = {}  # by tick: observed, sent, arrived [ns]
-        self._answers: dict[int, list[int]] = {}  # by number: begun, left, received, executed [ns]
-        self._basis: dict[int, list[int]] = {}  # by tick of the observation: its answers
+        # By number: tick of the observation; begun, left, received, executed [ns].
+        self._answers: dict[int, list[int]] = {}
         self._newest = 0  # number of the answer that was received last
 
     def ask(self, tick: int, now_ns: int) -> None:
@@ -50,12 +50,11 @@ class Answers:
 
     def begin(self, number: int, tick: int, at_ns: int) -> None:
         """Note that the policy begins an answer to the observation of a tick [ns]."""
-        self._answers[number] = [at_ns, NEVER_NS, NEVER_NS, NEVER_NS]
-        self._basis.setdefault(tick, []).append(number)
+        self._answers[number] = [tick, at_ns, NEVER_NS, NEVER_NS, NEVER_NS]
 
     def note(self, number: int, instant: int, at_ns: int) -> None:
         """Note an instant [ns] of an answer: `LEFT` or `RECEIVED`."""
-        self._answers[number][instant - BEGUN] = at_ns
+        self._answers[number][instant - ARRIVED] = at_ns
         if instant == RECEIVED:
             self._newest = number
 
@@ -67,20 +66,22 @@ class Answers:
         """
         number = int(basis) if basis == int(basis) else self._newest
         row = self._answers.get(number)
-        if row is not None and row[EXECUTED - BEGUN] < 0 <= row[RECEIVED - BEGUN]:
-            row[EXECUTED - BEGUN] = max(now_ns, row[RECEIVED - BEGUN])
+        if row is not None and row[-1] < 0 <= row[-2]:  # received, and not executed yet
+            row[-1] = max(now_ns, row[-2])
 
     def table(self) -> dict[str, Instants]:
         """Return `tick` of the observation and the instants of `CUTS` [ns], each of shape (n,).
 
         A row is an answer, or an observation without one. -1 stands for what never happened.
         """
-        no_answer = [[NEVER_NS] * 4]
+        answers: dict[int, list[list[int]]] = {}  # by tick of their observation
+        for tick, *instants in self._answers.values():
+            answers.setdefault(tick, []).append(instants)
+        none = [[NEVER_NS] * 4]
         found = [
-            [tick, *observed, *answer]
+            [tick, *observed, *instants]
             for tick, observed in self._observations.items()
-            for answer in [self._answers[number] for number in self._basis.get(tick, ())]
-            or no_answer
+            for instants in answers.get(tick, none)
         ]
         columns = np.array(found, np.int64).reshape(-1, 1 + len(CUTS)).T
         return dict(zip(("tick", *CUTS), columns, strict=True))

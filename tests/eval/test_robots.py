@@ -9,6 +9,7 @@ import pytest
 from cloudrc.eval.episode import play as play_alone
 from cloudrc.eval.robots import play
 from cloudrc.eval.setup import BASELINE, Episode, EvalSetup, SharedChannel
+from cloudrc.timeline.read import read_loops
 from cloudrc.trials.rows import read_rows
 
 
@@ -38,6 +39,15 @@ def test_without_a_network_each_robot_is_alone_with_a_seed_of_its_own(law):
     for robot, each in zip(row["robots"], seeds, strict=True):
         assert robot["return"] == each["numbers"]["return"]
         assert robot["steps"] == each["numbers"]["steps"]
+
+
+def test_each_robot_keeps_a_timeline_with_its_own_means(law, tmp_path):
+    row = play(Episode(0.0, "newest", 2), setup_of(law), keep=tmp_path / "episode.json")
+    files = [tmp_path / f"episode-robot{n}.json" for n in range(3)]
+    for path, robot in zip(files, row["robots"], strict=True):
+        stages = read_loops(path)["episode"].document["stages"]
+        assert robot["budget_uplink"] == pytest.approx(stages["uplink"]["mean"], abs=1e-9)
+    assert sorted(tmp_path.glob("*.json")) == files
 
 
 def test_robots_and_channel_are_part_of_what_is_played_and_their_absence_is_not(law, tmp_path):

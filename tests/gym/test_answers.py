@@ -47,6 +47,7 @@ def cuts_of(env):
         (ROUGH, {"chunk": 8, "executor": "ensemble"}),
         (ROUGH, {"delivery": "stream", "answer_within": 0.0}),
         ("ideal", {"start": "answer"}),
+        (ROUGH, {"answers": "step"}),
     ],
 )
 def test_stages_add_up_to_the_age_of_each_executed_answer(link, options):
