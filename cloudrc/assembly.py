@@ -10,32 +10,36 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
+from functools import partial
 from itertools import count
-from math import degrees, dist, inf, pi, radians
+from math import degrees, inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cloudrc.cloud.compute_time import ComputeTime, compute_time
 from cloudrc.cloud.controllers import Controller
 from cloudrc.cloud.controllers.remote import ControllerChannel, OutsideController
-from cloudrc.cloud.endpoint import CloudEndpoint, ComputeTime
+from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.news import SendOnDelta
 from cloudrc.cloud.operator import Operator
+from cloudrc.cloud.perceiving import Here, Perceiver
 from cloudrc.cloud.planar import Planar
 from cloudrc.config import schema
-from cloudrc.config.compute import compute_times
 from cloudrc.config.faults import CLOUD_KILLED, CLOUD_PAUSED, WORLD_PAUSED, acting
 from cloudrc.config.overrides import build_plugin
-from cloudrc.config.resolved import ResolvedExperiment, ResolvedGuard
-from cloudrc.config.robot import RobotFacts, facts, is_planar
+from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.robot import RobotFacts, facts, is_planar, known_robot
 from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.config.time_line import find_ways
 from cloudrc.drivers.channels import find_channel
+from cloudrc.endpoint import Worker
 from cloudrc.errors import ControllerLostError
-from cloudrc.geometry.fence import Fence
+from cloudrc.geometry.rays import angles_of
+from cloudrc.legs import LEG_FACTOR, leg_to, step_legs
 from cloudrc.link.cell import FRAME_NS, Bulk, Cell, Video
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DIRECTIONS
@@ -55,20 +59,10 @@ if TYPE_CHECKING:
     from cloudrc.teleop.store import Order
     from cloudrc.world.endpoint import WorldEndpoint
 
-MS_TO_NS = 1_000_000
 SECOND_NS = 1_000_000_000
 CLOUD_CLOCK = b"cloud".ljust(16)
 """Identity of cloud's clock in virtual time, if it differs from world's clock."""
 MEASURED = "Not repeatable: cloud.compute_measured uses the processor time of this machine."
-CRUISE_SPEED = 1.0
-"""Expected speed between two waypoints, if the guard allows this speed [m/s]."""
-TURN_RATE = 1.0
-"""Expected yaw rate, if the guard allows it [rad/s]."""
-SETTLE_TIME = 4.0
-"""Expected extra time at the beginning and end of the way to a waypoint [s]."""
-LEG_FACTOR = 3.0
-"""Time limit for the way to a waypoint, as a multiple of the expected time.
-Source: docs/reference/faults.md, "F28"."""
 LIMIT_MIN = 60.0
 """Smallest time limit of a mission whose order gives none [s]."""
 ONLY_MISSION = 1
@@ -240,13 +234,21 @@ def build_world(
         for name in ("odometry noise", "attitude noise", "wind")
     )
     wind = Wind(world.wind, air) if world.wind.blows else None
+    robot, scanner = build_robot(world, experiment.guard, wind), None
+    scan = known_robot(world.robot).scan
+    if experiment.scans and scan is not None:
+        from cloudrc.sim.scan import Scanner
+
+        errors = generator(seed, "scan noise", experiment.stream)
+        scanner = Scanner(robot.simulator.model, robot.simulator.data, scan, errors)
     return WorldEndpoint(
-        build_robot(world, experiment.guard, wind),
+        robot,
         Sensors(world.sensors, noise, turn_noise),
         identity,
         newest_wins=experiment.tunnel.order == "newest",
         odometry_period_ns=SECOND_NS // world.odometry_rate_hz,
         start_ns=clock(),
+        scanner=scanner,
     )
 
 
@@ -260,6 +262,7 @@ def build_cloud(
     make_loop: Callable[..., ControlLoop] = ControlLoop,
     channel: ControllerChannel | None = None,
     compute: ComputeTime | None = None,
+    make_worker: Callable[[ComputeTime | None], Worker] = Here,
 ) -> CloudEndpoint:
     """Build cloud: plug-ins, and cloud's end of the tunnel.
 
@@ -267,16 +270,39 @@ def build_cloud(
     `cpu_clock` returns the processor time of this thread [ns], which delays commands if
     `cloud.compute_measured` is set. `make_loop` is called in place of `ControlLoop`, for example to
     make a loop that lies. `channel` leads to a program outside that controls the robot. `compute`
-    takes the place of the time that the experiment says.
+    takes the place of the time that the experiment says. `make_worker` makes what calls the
+    perception, whose emulated time it gets.
     """
     cloud = experiment.cloud
     controller = build_controller(experiment)
     remote = controller if isinstance(controller, OutsideController) else None
     if is_planar(experiment.world.robot):
         controller = Planar(controller, cloud.controller.name)
+    loop = _build_loop(experiment, controller, make_loop)
+    if remote is not None and channel is not None:
+        remote.connect(channel, loop.period_ns * 1e-9, loop.counts, lambda: loop.newest)
+    measured = cpu_clock if cloud.compute_measured else None
+    if compute is None:
+        compute = build_compute_time(experiment, measured)
+    return CloudEndpoint(
+        loop,
+        teleop,
+        identity,
+        newest_wins=experiment.tunnel.order == "newest",
+        compute=compute,
+        perceiver=_build_perceiver(experiment, loop, make_worker, measured),
+        start_ns=clock(),
+        on_arrival=cloud.answers == "arrival",
+    )
+
+
+def _build_loop(
+    experiment: ResolvedExperiment, controller: Controller, make_loop: Callable[..., ControlLoop]
+) -> ControlLoop:
+    cloud = experiment.cloud
     beat, delta = cloud.beat, cloud.send_delta_mps
     news = None if delta is None else SendOnDelta(delta, beat)
-    loop = make_loop(
+    return make_loop(
         lambda: build_plugin("estimators", cloud.estimator),
         build_plugin("predictors", cloud.predictor, robot=_facts_of(experiment)),
         controller,
@@ -286,18 +312,23 @@ def build_cloud(
         plan=cloud.plan_s,
         news=news,
     )
-    if remote is not None and channel is not None:
-        remote.connect(channel, loop.period_ns * 1e-9, loop.counts, lambda: loop.newest)
-    if compute is None:
-        compute = build_compute_time(experiment, cpu_clock if cloud.compute_measured else None)
-    newest_wins = experiment.tunnel.order == "newest"
-    return CloudEndpoint(
-        *(loop, teleop, identity),
-        newest_wins=newest_wins,
-        compute=compute,
-        start_ns=clock(),
-        on_arrival=cloud.answers == "arrival",
-    )
+
+
+def _build_perceiver(
+    experiment: ResolvedExperiment,
+    loop: ControlLoop,
+    make_worker: Callable[[ComputeTime | None], Worker],
+    cpu_clock: Callable[[], int] | None,
+) -> Perceiver | None:
+    """Build what steers by the robot's scans; None without a perception."""
+    cloud, scan = experiment.cloud, known_robot(experiment.world.robot).scan
+    if cloud.perception is None or scan is None:
+        return None
+    perception = build_plugin("perceptions", cloud.perception, robot=_facts_of(experiment))
+    draws = generator(experiment.seed, "perception time", experiment.stream)
+    worker = make_worker(compute_time(cloud, cloud.perception_ms, draws, cpu_clock))
+    fence, angles = steered_in(experiment.world), angles_of(scan.rays, scan.fov_deg)
+    return Perceiver(perception, worker, fence, angles, partial(loop.note_failure, "perception"))
 
 
 def build_compute_time(
@@ -305,13 +336,14 @@ def build_compute_time(
 ) -> ComputeTime | None:
     """Build the time that cloud needs for a command, plus that of `cpu_clock`; None: no time."""
     cloud = experiment.cloud
-    if not (cloud.compute_ms or cpu_clock):
-        return None
-    scale = MS_TO_NS / cloud.speed
-    times = [each * scale for each in compute_times(cloud.compute_ms)]
-    draws = generator(experiment.seed, "compute time", experiment.stream)
-    deviation, drawn = cloud.compute_deviation_ms * scale, times if len(times) > 1 else ()
-    return ComputeTime(times[0], deviation, draws, cpu_clock, cloud.cpu_share, drawn)
+    return compute_time(
+        cloud,
+        cloud.compute_ms,
+        generator(experiment.seed, "compute time", experiment.stream),
+        cpu_clock,
+        deviation_ms=cloud.compute_deviation_ms,
+        cpu_share=cloud.cpu_share,
+    )
 
 
 def build_controller(experiment: ResolvedExperiment) -> Controller:
@@ -385,12 +417,12 @@ def build_plan(
         legs: tuple[Leg, ...] = (Leg(track[0][1], tolerance=inf, time_limit=inf),)
         needed = LEG_FACTOR * track[-1][0]
     elif mission.steps is not None:
-        legs = _step_legs(mission.steps, experiment)
+        legs = step_legs(mission.steps, generator(experiment.seed, "steps", experiment.stream))
         needed = LEG_FACTOR * mission.steps.count * mission.steps.period_s
     else:
         points = mission.waypoints
         legs = tuple(
-            _leg(before, waypoint, fence, experiment.guard, mission.carrot)
+            leg_to(before, waypoint, fence, experiment.guard, mission.carrot)
             for before, waypoint in zip((None, *points), points, strict=False)
         )
         needed = sum(leg.time_limit for leg in legs)
@@ -433,50 +465,6 @@ def with_order(
     criteria = experiment.criteria.model_copy(update=judged)
     changed = {"mission": mission, "criteria": criteria, "description": description}
     return experiment.model_copy(update=changed)
-
-
-def _leg(
-    before: schema.Waypoint | None,
-    waypoint: schema.Waypoint,
-    fence: Fence,
-    guard: ResolvedGuard,
-    carrot: schema.Carrot | None,
-) -> Leg:
-    """Convert the waypoint at the end of a way."""
-    speed_max, speed, acceleration = guard.speed_max_mps, 0.0, 1.0
-    if carrot is not None:
-        speed_max = speed = min(waypoint.speed_mps or carrot.speed_mps, speed_max)
-        acceleration = carrot.acceleration_mps2
-    limit = waypoint.time_limit_s
-    if limit is None:
-        # If the start of the way is unknown, assume the longest way.
-        start, end = (before or waypoint).position_m, waypoint.position_m
-        way = dist(fence.low, fence.high) if before is None else dist(start, end)
-        expected = way / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
-        if waypoint.yaw_deg is not None:
-            expected += pi / min(TURN_RATE, guard.yaw_rate_max_radps)  # the longest turn
-        limit = round(LEG_FACTOR * expected, 1)
-    return Leg(
-        waypoint.position_m,
-        None if waypoint.yaw_deg is None else radians(waypoint.yaw_deg),
-        waypoint.tolerance_m,
-        waypoint.dwell_s,
-        limit,
-        speed,
-        acceleration,
-        waypoint.yaw_tolerance,
-    )
-
-
-def _step_legs(steps: schema.Steps, experiment: ResolvedExperiment) -> tuple[Leg, ...]:
-    """Make random setpoints. Each lasts one period, even if the robot does not arrive."""
-    rng = generator(experiment.seed, "steps", experiment.stream)
-    offsets = rng.uniform(-1.0, 1.0, (steps.count, 3)) * steps.range_m + steps.centre_m
-    limit = 10 * steps.period_s
-    return tuple(
-        Leg((x, y, z), tolerance=inf, dwell=steps.period_s, time_limit=limit)
-        for x, y, z in offsets.tolist()
-    )
 
 
 def generator(seed: int, *names: str) -> np.random.Generator:

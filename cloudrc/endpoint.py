@@ -18,7 +18,8 @@ endpoint can detect datagrams that waited in the socket while its process was st
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 from cloudrc.messages import Datagram
 from cloudrc.records import Record
@@ -41,3 +42,22 @@ class Endpoint(Protocol):
 
     def take_records(self) -> list[Record]:
         """Return the records, oldest first; the next call returns only newer ones."""
+
+
+class Outcome(NamedTuple):
+    """What a call of a user's code returned or raised; times are on the end's clock."""
+
+    result: Any
+    error: BaseException | None
+    begun_ns: int
+    done_ns: int
+
+
+class Worker(Protocol):
+    """Makes calls that may take long, one at a time, beside an endpoint: here or in a thread."""
+
+    def begin(self, call: Callable[[], Any], now_ns: int) -> None:
+        """Begin a call at `now_ns` [ns], the end's clock; the outcome of the last one is taken."""
+
+    def take(self) -> Outcome | None:
+        """Return the outcome of the call once, as soon as it is known."""

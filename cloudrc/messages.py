@@ -146,6 +146,17 @@ class Telemetry(NamedTuple):
     cause: Annotated[Cause, "", CAUSES] = Cause.SPAWN  # after touch-down in LAND, of the landing
 
 
+RAYS_MAX = 541
+"""Largest number of rays of a scan: one datagram holds them."""
+
+
+class RangeScan(NamedTuple):
+    """Message from world to cloud: the distances that a scanner measured at one time."""
+
+    stamp_ns: int  # time of the measurement [ns], world's clock
+    millimetres: tuple[int, ...]  # a distance per ray, from right to left; 0: nothing within range
+
+
 PLAN_STEP_NS = 10_000_000
 """Time between two velocities of a plan [ns]."""
 

@@ -12,6 +12,7 @@ unit ("" if it has none) and the meaning.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple, TypeAlias, get_args
 
 from cloudrc.messages import (
@@ -31,6 +32,8 @@ Number: TypeAlias = Annotated[int, "", "counter in the datagram's header"]
 UNSENT = -1
 """Counter of a command that cloud did not send."""
 Basis: TypeAlias = Annotated[int, "ns", "stamp of the odometry used, world's clock"]
+Numbers: TypeAlias = Sequence[float]
+"""As many numbers in each record of a flight."""
 End: TypeAlias = Annotated[str, "", "process that recorded the row: world, cloud or link"]
 
 
@@ -153,6 +156,19 @@ class SensorRead(NamedTuple):
     value: Annotated[float, "see unit", "what the sensor shows"]
 
 
+class ScanTaken(NamedTuple):
+    """Made by world: the robot's scanner has measured, and world has sent the scan. Topic /scan."""
+
+    stamp_ns: int
+    epoch: int  # those of its datagram; ROS's message has no place for them
+    counter: int
+    angle_min: Annotated[float, "rad", "of the first ray, rightmost; 0 is ahead"]
+    angle_increment: Annotated[float, "rad", "between two rays"]
+    scan_time: Annotated[float, "s", "between two scans"]
+    range_max: Annotated[float, "m", "longest distance that the scanner sees"]
+    ranges: Annotated[Numbers, "m", "of all rays, as measured; inf: nothing within range"]
+
+
 class Arrival(NamedTuple):
     """Made by world or cloud: a datagram with a command or telemetry arrived, even if late.
 
@@ -271,6 +287,23 @@ class CellWait(NamedTuple):
     wait_ns: Annotated[int, "ns", "from its departure until the cell had sent all of it"]
 
 
+class Perceived(NamedTuple):
+    """Made by cloud: what became of a scan that the perception has looked at. Topic /perception.
+
+    Cloud makes the record with the first command from the perception's setpoint, or when nothing
+    can follow any more. The durations lead back from the stamp to the arrival of the scan.
+    """
+
+    stamp_ns: int
+    seen_stamp_ns: Annotated[int, "ns", "stamp of the scan, world's clock"]
+    wait_ns: Annotated[int, "ns", "from its arrival until the perception began with it"]
+    compute_ns: Annotated[int, "ns", "from there until the perception was done"]
+    hold_ns: Annotated[int, "ns", "from there until the stamp of the row"]
+    epoch: Epoch
+    counter: Annotated[int, "", "counter of the first command from its setpoint; -1: none"]
+    position: Annotated[Vector, "m", "of the setpoint, inside the fence; NaN: none"]
+
+
 class PlanFollowed(NamedTuple):
     """Made by cloud: which position a plan had predicted for the newest odometry. Topic /plan.
 
@@ -377,5 +410,6 @@ Record: TypeAlias = (
     (TelemetrySent | GroundTruth | ContactForce | SensorRead | Arrival | CommandApplied)
     | (EnergyUsed | Left | CellWait)
     | (GuardChange | Contact | SessionOpened | Control | PlanFollowed | MissionEvent)
+    | (ScanTaken | Perceived)
     | (Fault | Counted | LinkChanged | LinkChecked | Lateness)
 )

@@ -24,7 +24,7 @@ from cloudrc.messages import ZERO, plan_length
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.rounding import exceeds
 from cloudrc.teleop.wire import Plan
-from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES
+from cloudrc.tunnel.codec import COMMAND_SIZES, SCAN_SIZES, TELEMETRY_SIZES
 
 GUARD_STEP = 0.002
 """Time between two looks of the guard at the age of a command [s]."""
@@ -85,13 +85,16 @@ def _advise(experiment: ResolvedExperiment) -> Iterator[str]:
 def _low_rates(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield a warning for each direction whose bottleneck is slower than its packets need."""
     command = COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
-    telemetry = TELEMETRY_SIZES[len(known_robot(experiment.world.robot).sensors)]
+    robot = known_robot(experiment.world.robot)
+    telemetry, scan = TELEMETRY_SIZES[len(robot.sensors)], robot.scan if experiment.scans else None
     needs = (
         ("uplink", "telemetry", telemetry, experiment.world.odometry_rate_hz),
         ("downlink", "the stream of commands", command, experiment.cloud.command_rate_hz),
     )
     for name, what, size, rate in needs:
         needed = (size + HEADER_BYTES) * 8.0 * rate
+        if scan is not None and name == "uplink":
+            needed += (SCAN_SIZES[scan.rays] + HEADER_BYTES) * 8.0 * scan.rate_hz
         if doubt := describe_low_rate(getattr(experiment, name), name, needed, what):
             yield doubt
 

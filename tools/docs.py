@@ -74,6 +74,9 @@ _STAMPS = {
     ("instant at which this session begins in world or in cloud", "once per event"): "/session",
     ("departure of the command", _PERIOD):
         "/estimated_odometry /setpoint_position /cmd_vel /delay_estimate /pid",
+    ("physics step at which the scan is taken", "`rate_hz` of the scanner, in a session"): "/scan",
+    ("first command from the perception's setpoint; without one, when that is known",
+     "once per scan that the perception has looked at"): "/perception",
     ("arrival of the telemetry at cloud", "once per telemetry while the robot follows a plan"):
         "/plan",
     ("departure of the command", "once per command whose computation takes simulated time"):

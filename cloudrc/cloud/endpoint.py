@@ -12,12 +12,11 @@ the operator's requests.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import nan
 from typing import Any
 
-import numpy as np
-
+from cloudrc.cloud.compute_time import ComputeTime
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import (
     EmergencyStopRepeater,
@@ -25,12 +24,14 @@ from cloudrc.cloud.operator import (
     is_for_session,
     make_robot_status,
 )
+from cloudrc.cloud.perceiving import Perceiver
 from cloudrc.errors import ControllerLostError
 from cloudrc.messages import (
     NEVER_NS,
     Datagram,
     GuardState,
     OperatorRequest,
+    RangeScan,
     Request,
     Setpoint,
     Telemetry,
@@ -45,7 +46,7 @@ from cloudrc.records import (
     SessionOpened,
 )
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import LATE, REPEATED, USED
+from cloudrc.tunnel.channel import LATE, REPEATED, USED, ReceiveWindow
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
 from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake
@@ -69,86 +70,13 @@ ALIVE_PERIOD_NS = 100_000_000
 """Time between two ALIVE datagrams while there is no command [ns]."""
 PATIENCE_NS = 5_000_000_000
 """Time without a session after which cloud reports a fault [ns]."""
-QUOTA_PERIOD_NS = 100_000_000
-"""Time between two refills of a CPU limit [ns].
-Source: Linux, Documentation/scheduler/sched-bwc.rst; Kubernetes, default of cpuCFSQuotaPeriod."""
 COUNT_PERIOD_NS = 1_000_000_000
 """Time between two records of the counters [ns]."""
 SILENT_PERIODS = 3
 """With answers on arrival, cloud sends a command after so many half periods without newer
 telemetry: the guard needs 10 in 500 ms to leave HOLD."""
-COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
+COMMAND, TELEMETRY, SCAN = int(Kind.COMMAND), int(Kind.TELEMETRY), int(Kind.SCAN)  # often used
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
-
-
-class ComputeTime:
-    """Simulated time to compute a command: constant, random or measured.
-
-    A random time has a gamma distribution, which is never negative and sometimes long.
-
-    With a CPU limit, cloud computes for a share of each QUOTA_PERIOD_NS, and then stands still
-    until the next of these periods. So a CPU limit is no slow processor: most short computations
-    are as fast as without it, some wait long.
-    Source: Linux, Documentation/scheduler/sched-bwc.rst.
-    Deviation: the periods follow each other without a gap, also while cloud is idle.
-    """
-
-    def __init__(
-        self,
-        mean_ns: float,
-        deviation_ns: float,
-        rng: np.random.Generator,
-        cpu_clock: Callable[[], int] | None = None,
-        cpu_share: float = 1.0,
-        times_ns: Sequence[float] = (),
-    ) -> None:
-        """Set mean `mean_ns` and standard deviation `deviation_ns` of the compute time [ns].
-
-        `cpu_clock` returns the CPU time used so far [ns]. If it is given, the CPU time between
-        `begin` and `end` is added. `cpu_share` is the CPU limit, in processors [1]. Of `times_ns`,
-        if there are any, each computation takes a random one [ns].
-        """
-        self._times_ns = times_ns
-        self._mean_ns, self._deviation_ns, self._rng = mean_ns, deviation_ns, rng
-        self._cpu_clock, self._began_ns = cpu_clock, 0
-        self._quota_ns = round(cpu_share * QUOTA_PERIOD_NS)
-        self._used_ns, self._period = 0, 0  # time used in the period with this number
-
-    def begin(self) -> None:
-        """Note that the computation of a command begins; call `end` at its end."""
-        if self._cpu_clock is not None:
-            self._began_ns = self._cpu_clock()
-
-    def end(self, began_ns: int) -> int:
-        """Return the simulated duration [ns] of the computation that started with `begin`.
-
-        It began at `began_ns` [ns], cloud's clock.
-        """
-        time_ns = self._mean_ns
-        if self._times_ns:
-            time_ns = self._times_ns[int(self._rng.integers(len(self._times_ns)))]
-        elif self._deviation_ns:
-            shape = (self._mean_ns / self._deviation_ns) ** 2
-            time_ns = self._rng.gamma(shape, self._mean_ns / shape)
-        if self._cpu_clock is not None:
-            time_ns += self._cpu_clock() - self._began_ns
-        return self._limit(round(time_ns), began_ns)
-
-    def _limit(self, left_ns: int, began_ns: int) -> int:
-        """Return how long a computation lasts under the CPU limit [ns].
-
-        `left_ns` is the processor time that it needs, `began_ns` when it began, both [ns].
-        """
-        now_ns = began_ns
-        while left_ns and self._quota_ns < QUOTA_PERIOD_NS:
-            period = now_ns // QUOTA_PERIOD_NS
-            if period != self._period:
-                self._used_ns, self._period = 0, period
-            end_ns = (period + 1) * QUOTA_PERIOD_NS
-            run_ns = min(left_ns, self._quota_ns - self._used_ns, end_ns - now_ns)
-            left_ns, self._used_ns = left_ns - run_ns, self._used_ns + run_ns
-            now_ns = end_ns if left_ns else now_ns + run_ns
-        return now_ns - began_ns + left_ns
 
 
 class CloudEndpoint(TunnelEnd):
@@ -158,6 +86,7 @@ class CloudEndpoint(TunnelEnd):
         teleop: Source of setpoints and operator requests.
         telemetry: The newest telemetry; None before the first.
         watch: Is called with epoch, counter and content of each telemetry that cloud uses.
+        watch_scan: Is called likewise with each scan.
     """
 
     def __init__(
@@ -168,6 +97,7 @@ class CloudEndpoint(TunnelEnd):
         *,
         newest_wins: bool,
         compute: ComputeTime | None = None,
+        perceiver: Perceiver | None = None,
         start_ns: int = 0,
         on_arrival: bool = False,
     ) -> None:
@@ -179,6 +109,7 @@ class CloudEndpoint(TunnelEnd):
             identity: Identity and keys of this end.
             newest_wins: Whether to drop telemetry that arrives after newer telemetry.
             compute: The simulated time between computation and departure of a command; None: 0.
+            perceiver: Makes setpoints of the robot's scans; None: scans change nothing.
             start_ns: The present time on cloud's monotonic clock [ns].
             on_arrival: Whether newer telemetry, and not a period, makes a command due.
         """
@@ -187,9 +118,11 @@ class CloudEndpoint(TunnelEnd):
         self._handshake = ClientHandshake(identity.nonce, identity.clock_id)
         self._hellos = 0
         self._setpoint: Setpoint | None = None
+        self._perceiver, self._scan_channel = perceiver, ReceiveWindow(newest_wins=True)
         self._world = ""  # identifies the world process of the session
         self.telemetry: Telemetry | None = None
         self.watch: Callable[[int, int, Telemetry], None] | None = None
+        self.watch_scan: Callable[[int, int, RangeScan], None] | None = None
         self._control: Control | None = None  # record of the session's last command
         self._uplink_delay = nan  # of the newest telemetry [s]
         self._alarm = EmergencyStopRepeater()
@@ -242,11 +175,7 @@ class CloudEndpoint(TunnelEnd):
         if now_ns < self.next_deadline_ns():
             return
         if self._unsent is not None:
-            if (datagram := self._unsent[1]) is not None:
-                self._queue(datagram)
-                if (made := self._control) is not None:
-                    self._records.append(Left(now_ns, made.epoch, made.counter))
-            self._unsent = None
+            self._send_computed(self._unsent[1], now_ns)
         if now_ns < self._tick_ns:
             self._answer_if_due(now_ns)
             return
@@ -260,11 +189,21 @@ class CloudEndpoint(TunnelEnd):
         if lacks or session.is_outdated:
             self._ask_for_session_if_due(now_ns, lacks=lacks)
         self._act(now_ns)
+        if self._perceiver is not None:
+            self._records += self._perceiver.take_records()
         if now_ns >= self._count_ns:
             self._count_ns = max(self._count_ns, now_ns - COUNT_PERIOD_NS) + COUNT_PERIOD_NS
             self._record_counts(now_ns)
         if self._loop.faults:
             self._records += self._loop.take_faults()
+
+    def _send_computed(self, datagram: Datagram | None, now_ns: int) -> None:
+        """Send the command whose computation is over, if there is one."""
+        self._unsent = None
+        if datagram is not None:
+            self._queue(datagram)
+            if (made := self._control) is not None:
+                self._records.append(Left(now_ns, made.epoch, made.counter))
 
     def _ask_for_session_if_due(self, now_ns: int, *, lacks: bool) -> None:
         """Ask for a session while cloud `lacks` one, and for a new one after the key changed."""
@@ -310,6 +249,8 @@ class CloudEndpoint(TunnelEnd):
             kind, epoch, counter, body = self._session.open(data)
             if kind == TELEMETRY:
                 self._receive_telemetry(epoch, counter, body, now_ns)
+            elif kind == SCAN:
+                self._receive_scan(epoch, counter, body, now_ns)
             elif kind == Kind.ACCEPT:
                 self._receive_accept(epoch, Accept(*codec.decode(Kind.ACCEPT, body)), now_ns)
             elif kind == Kind.CHALLENGE:
@@ -373,6 +314,9 @@ class CloudEndpoint(TunnelEnd):
         self._session.begin(epoch, nonces, self._session.greeting_key)
         self._told.clear()
         self._channel.reset()
+        self._scan_channel.reset()
+        if self._perceiver is not None:
+            self._perceiver.begin_session()
         self._loop.reset(now_ns)
         self._setpoint = None  # the robot may have moved; teleop sends a new one
         self._control, self._uplink_delay = None, nan
@@ -398,12 +342,26 @@ class CloudEndpoint(TunnelEnd):
             fields = now_ns, True, epoch, counter, delay, used, *echo
             is_sample = used and self._loop.gives_sample(*echo)
             self._records.append(_new(Arrival, (*fields, is_sample)))
+        if self._perceiver is not None and outcome != REPEATED:
+            self._perceiver.observe(telemetry.odometry, now_ns)
         if outcome == LATE:
             self._loop.observe_late(telemetry, now_ns)
         if used:
             if self.watch is not None:
                 self.watch(epoch, counter, telemetry)
             self._use_telemetry(telemetry, epoch, delay, now_ns)
+
+    def _receive_scan(self, epoch: int, counter: int, body: Any, now_ns: int) -> None:
+        """Give a scan that is newer than all before to the perception."""
+        outcome = self._scan_channel.take(counter)
+        scan = codec.decode_scan(body) if type(body) is bytes else body
+        if outcome != USED:
+            self.counts[f"scan_{outcome}"] += 1
+            return
+        if self.watch_scan is not None:
+            self.watch_scan(epoch, counter, scan)
+        if self._perceiver is not None:
+            self._perceiver.receive_scan(scan, now_ns)
 
     def _use_telemetry(self, telemetry: Telemetry, epoch: int, delay: float, now_ns: int) -> None:
         """Give telemetry, newer than all before, to the loop and to teleop.
@@ -441,6 +399,8 @@ class CloudEndpoint(TunnelEnd):
                 if isinstance(message, MissionEvent):
                     if message.event == "started":
                         self._loop.start_mission()
+                        if self._perceiver is not None:
+                            self._perceiver.begin_mission()
                     if message.event == "started" or message.event not in UNDER_WAY:
                         self._record_counts(message.stamp_ns)
 
@@ -469,6 +429,9 @@ class CloudEndpoint(TunnelEnd):
         self._send(Kind.OPERATOR, codec.encode_operator(stamped))
 
     def _send_command(self, setpoint: Setpoint, now_ns: int) -> None:
+        perceiver = self._perceiver
+        if perceiver is not None:
+            setpoint = perceiver.steer(setpoint, now_ns)
         elapsed_ns = now_ns - self._commanded_ns if self._commanded_ns >= 0 else self._period_ns
         self._commanded_ns = now_ns
         epoch, counter = self._session.epoch, self._session.next_counter(COMMAND)
@@ -489,8 +452,12 @@ class CloudEndpoint(TunnelEnd):
             self._queue(datagram)
         self._records.append(control)
         self._control = control
+        if perceiver is not None:
+            perceiver.note_command(setpoint, epoch, control.counter, now_ns)
 
     def _record_counts(self, now_ns: int) -> None:
         self.count_sent()
+        if self._perceiver is not None:
+            self.counts |= self._perceiver.counts
         for name, count in sorted(self.counts.items()):
             self._records.append(Counted(now_ns, "cloud", name, count))

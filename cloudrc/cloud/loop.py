@@ -65,6 +65,7 @@ INSTEAD = {
     "estimator": "cloud uses the last good horizon",
     "predictor": "cloud uses the last sample without a prediction",
     "controller": "cloud commands zero velocity",
+    "perception": "its last setpoint stays",
 }
 """Kind of plug-in -> what cloud does when a plug-in of this kind fails."""
 GOES_ON = "cloud goes on using it"
@@ -148,7 +149,7 @@ class ControlLoop:
         try:
             estimator = self._build_estimator()
         except FAILURES as error:
-            self._note("estimator", error)
+            self.note_failure("estimator", error)
             estimator = Estimator()  # it has no estimate, so the horizon stays 0
         self._call("predictor", self._predictor.reset)
         self._call("controller", self._controller.reset)
@@ -203,7 +204,7 @@ class ControlLoop:
         try:
             self._observe_delay(telemetry, now_ns)
         except FAILURES as error:
-            self._note("estimator", error, GOES_ON)
+            self.note_failure("estimator", error, GOES_ON)
         if self._observe is not None:
             self._call("predictor", self._observe, telemetry.odometry)
 
@@ -272,7 +273,7 @@ class ControlLoop:
                 return horizon
             horizon = RESULT.of(horizon, "horizon")
         except FAILURES as error:
-            self._note("estimator", error)
+            self.note_failure("estimator", error)
             return self._horizon
         self.counts["horizon_clamped"] += 1
         return float(min(max(horizon, 0.0), self._horizon_max))
@@ -337,7 +338,7 @@ class ControlLoop:
             estimate = self._predictor.predict(basis, horizon)
             return estimate if self._trusts_predictor else check_estimate(estimate)
         except FAILURES as error:
-            self._note("predictor", error)
+            self.note_failure("predictor", error)
             return basis
 
     def _steer(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput | None:
@@ -355,7 +356,7 @@ class ControlLoop:
             self.faults.append(Fault(self._now_ns, error.code, str(error)))
             return STAND_STILL
         except FAILURES as error:
-            self._note("controller", error)
+            self.note_failure("controller", error)
             return STAND_STILL
 
     def _ask_plan(
@@ -383,7 +384,7 @@ class ControlLoop:
             positions = to_vectors(positions[: self._planned], "planned positions")
             return output, as_planned([*fits]), positions
         except FAILURES as error:
-            self._note(plug_in, error, INSTEAD["controller"])
+            self.note_failure(plug_in, error, INSTEAD["controller"])
             return STAND_STILL, [], []
 
     def _plan(self, velocity: Vector, now_ns: int) -> tuple[list[Vector], list[Vector]]:
@@ -429,7 +430,7 @@ class ControlLoop:
                 plan.append(velocity)
                 positions.append(state.position)
         except FAILURES as error:
-            self._note(plug_in, error, "cloud sends this command without a plan")
+            self.note_failure(plug_in, error, "cloud sends this command without a plan")
             return [], []
         return as_planned(plan), positions
 
@@ -449,9 +450,9 @@ class ControlLoop:
         try:
             call(*arguments)
         except FAILURES as error:
-            self._note(kind, error, GOES_ON)
+            self.note_failure(kind, error, GOES_ON)
 
-    def _note(self, kind: str, error: BaseException, instead: str = "") -> None:
+    def note_failure(self, kind: str, error: BaseException, instead: str = "") -> None:
         """Count a failure of the plug-in `kind`, such as "estimator"; report a mission's first one.
 
         `instead` tells the user what cloud does now; "" stands for the text in `INSTEAD`.

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from cloudrc.cloud.endpoint import ComputeTime
+from cloudrc.cloud.compute_time import ComputeTime
 
 FOREVER_NS = 1 << 62
 """Computing time of which the end is not known yet [ns]."""

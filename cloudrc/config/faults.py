@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from cloudrc.config.profile import BlackoutConfig, BurstsConfig, ChangeConfig, DirectionConfig
-from cloudrc.config.section import Section, leave_out_empty
+from cloudrc.config.section import Section, leave_out_unset
 from cloudrc.link.profile import NotNegative, Positive
 
 PARTITION, BURST, RAMP = "partition", "burst", "ramp"
@@ -82,7 +82,7 @@ class FaultConfig(Section):
     drift_ppm: Annotated[int, Field(ge=-1000, le=1000)] | None = None
     """By how much cloud's clock is faster than before [ppm]"""
 
-    _write = leave_out_empty("direction", *KEYS)
+    _write = leave_out_unset("direction", *KEYS)
 
     @model_validator(mode="after")
     def _check_keys(self) -> FaultConfig:

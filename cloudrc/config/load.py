@@ -200,7 +200,8 @@ def _read_robots(path: Path) -> list[dict[str, Any]]:
 def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> ResolvedExperiment:
     """Check that the mission fits the scene and the robot, and complete it with what they give."""
     mission = put_on_ground(experiment.mission, experiment.world)
-    found = [*_without_effect(document, experiment), *_check_mission(mission, experiment.world)]
+    found = [*_without_effect(document, experiment)]
+    found += [*_without_sensor(experiment)] or _check_mission(mission, experiment)
     problems.raise_problems(document, found, name)
     mission = without_held_yaws(mission, known_robot(experiment.world.robot).heading)
     return experiment.model_copy(update={"mission": mission})
@@ -223,16 +224,26 @@ def _without_effect(document: Document, experiment: ResolvedExperiment) -> Itera
                 yield ConfigProblem(path, str(document.get(*path)), text)
 
 
-def _check_mission(mission: MissionConfig, world: World) -> list[ConfigProblem]:
+def _without_sensor(experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
+    """List the keys that need a scanner, if the robot has none."""
+    robot, perception = experiment.world.robot, experiment.cloud.perception
+    if experiment.scans and known_robot(robot).scan is None:
+        path = ("cloud", "perception") if perception else ("world", "scan")
+        text = f"{robot} has no scanner: choose the rover, or give its robot.yaml the key scan"
+        yield ConfigProblem(path, perception.name if perception else "true", text)
+
+
+def _check_mission(mission: MissionConfig, experiment: ResolvedExperiment) -> list[ConfigProblem]:
     """List the problems of a mission in a scene, with their paths in the experiment."""
+    world, sees = experiment.world, experiment.cloud.perception is not None
 
     def check() -> list[ConfigProblem]:
         if above := check_scene(world, mission.touched):
             return above
-        wrong = check_mission(mission, world)
+        wrong = check_mission(mission, world, straight=not sees)
         return [problem._replace(path=("mission", *problem.path)) for problem in wrong]
 
-    key = "mission", mission.model_dump_json(), world.scene, world.fence_m, world.robot
+    key = "mission", mission.model_dump_json(), world.scene, world.fence_m, world.robot, sees
     return reuse(key, check)
 
 
@@ -454,7 +465,7 @@ def _resolve_paths(document: Document) -> list[ConfigProblem]:
     """Make all paths in an experiment absolute, and check the files; return problems."""
     found = resolve_files(document, ("link",))
     paths: list[KeyPath] = [("mission", "setpoints"), ("world", "robot"), ("world", "scene")]
-    paths.append(("cloud", "compute_ms"))
+    paths += [("cloud", key) for key in ("compute_ms", "perception_ms")]
     metrics = document.get("report", "metrics")
     if isinstance(metrics, list):
         named = [n for n, name in enumerate(metrics) if plugins.is_path(str(name))]
@@ -470,7 +481,7 @@ def _resolve_paths(document: Document) -> list[ConfigProblem]:
                 name = str(source.absolute(name))
             if key == "robot":
                 known_robot(name)
-            elif key == "compute_ms":
+            elif path[0] == "cloud":
                 compute_times(name)
             document.set_value(path, name, source)
     return found

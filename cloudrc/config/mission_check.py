@@ -67,8 +67,13 @@ def check_scene(world: World, touch: str | None) -> list[ConfigProblem]:
     return [ConfigProblem(("world", "scene"), scene.name, reason)]
 
 
-def check_mission(mission: MissionConfig, world: World) -> list[ConfigProblem]:
-    """List the problems of a mission for a robot in its scene, with paths inside the mission."""
+def check_mission(
+    mission: MissionConfig, world: World, *, straight: bool = True
+) -> list[ConfigProblem]:
+    """List the problems of a mission for a robot in its scene, with paths inside the mission.
+
+    Without `straight`, the robot finds its ways by itself, so that only waypoints are judged.
+    """
     scene, robot = scene_of(world), known_robot(world.robot)
     if problem := _check_parts(mission) or _check_touch(mission, scene):
         return [problem]
@@ -84,7 +89,9 @@ def check_mission(mission: MissionConfig, world: World) -> list[ConfigProblem]:
     if mission.steps is not None:
         reason = _check_steps(mission, mission.steps, scene, hull, fence)
         return [ConfigProblem(("steps",), "", reason)] if reason else []
-    return list(_check_fence(mission, fence) or _check_ways(mission, scene, hull))
+    return list(
+        _check_fence(mission, fence) or _check_ways(mission, scene, hull, straight=straight)
+    )
 
 
 def _check_parts(mission: MissionConfig) -> ConfigProblem | None:
@@ -130,14 +137,16 @@ def _check_fence(mission: MissionConfig, fence: Fence) -> list[ConfigProblem]:
     return [_at_point(index, positions[index], reason) for index in outside[:_REPORTED]]
 
 
-def _check_ways(mission: MissionConfig, scene: Scene, robot: Spheres) -> Iterator[ConfigProblem]:
-    """Yield the waypoints that are, or to which the straight way leads, too near to an obstacle."""
+def _check_ways(
+    mission: MissionConfig, scene: Scene, robot: Spheres, *, straight: bool
+) -> Iterator[ConfigProblem]:
+    """Yield the waypoints that are, or to which the `straight` way leads, near to an obstacle."""
     known, positions = obstacles(scene, touch=mission.touched), _positions(mission)
     hit = find_overlapped(known, robot, positions)
     for index in np.flatnonzero(hit >= 0)[:_REPORTED]:
         reason = f"the robot would be within {CLEARANCE_MIN:g} m of {surface(known[hit[index]])}"
         yield _at_point(index, positions[index], reason)
-    if (hit >= 0).any():
+    if (hit >= 0).any() or not straight:
         return
     through = find_crossed(known, robot, _starts(mission, scene), positions)
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:

@@ -41,13 +41,16 @@ from cloudrc.outside.reuse import reuse
 REMOTE, ROS2 = "remote", "ros2"
 OUTSIDE = (REMOTE, ROS2)
 """Name of the controller that asks a program outside."""
-KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "controllers"}
+KINDS = {
+    **{"estimator": "estimators", "predictor": "predictors", "controller": "controllers"},
+    "perception": "perceptions",
+}
 """Key under `cloud` -> kind of plug-in."""
 BRAKING = "braking_mps2"
 """Argument of an onboard controller's `build`: the braking in `guard` of robot.yaml [m/s^2]."""
 GIVEN = {
     *(("onboard", "model"), ("onboard", BRAKING)),
-    *(("predictors", "robot"), ("controllers", "robot")),
+    *(("predictors", "robot"), ("controllers", "robot"), ("perceptions", "robot")),
 }
 """Kind of plug-in and argument of its `build` that cloudrc gives, not the user."""
 _models = WeakKeyDictionary[Callable[..., Any], type[BaseModel]]()
@@ -224,6 +227,8 @@ def name_plugins(document: Document, cloud: Cloud) -> dict[KeyPath, dict[str, An
     made: dict[KeyPath, dict[str, Any]] = {}
     for key in KINDS:
         choice, path = getattr(cloud, key), ("cloud", key)
+        if choice is None:
+            continue
         given = {} if isinstance(choice, str) else dict(choice.model_extra)
         name = _absolute(document, path, choice if isinstance(choice, str) else choice.name)
         # Not by `set_value`: the parameters keep their sources.
@@ -280,6 +285,8 @@ def _try(
     with code.calling(f"{plugins.one(kind)} {name!r} has a default that YAML cannot contain"):
         values: dict[str, Any] = checked.model_dump(mode="json")
     plugin = _build(kind, name, checked, {"robot": robot})
+    if kind == "perceptions" and plugin.takes != "scan":
+        raise BadInputError(f"'{name}' takes {plugin.takes!r}; robots send scans, takes = 'scan'")
     if plans and name in OUTSIDE:
         raise BadInputError(f"'{name}' cannot plan ahead; set cloud.plan_s to 0")
     if plans and kind == "predictors":

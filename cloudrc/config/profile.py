@@ -11,11 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Discriminator, Tag, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from cloudrc.config import problems, shipped
 from cloudrc.config.problems import ConfigProblem
-from cloudrc.config.section import Section, leave_out_empty
+from cloudrc.config.section import Section, leave_out_unset
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import CLOUD_TIME_MAX as CLOUD_TIME_MAX
 from cloudrc.link.profile import COMMAND_AGE_MS as COMMAND_AGE_MS
@@ -84,6 +84,17 @@ class ChangeConfig(Section, Change):
     loss: LossConfig | None = None
 
 
+def _compute_tag(value: Any) -> str:
+    return "<file>" if isinstance(value, str) else "<time>"
+
+
+ComputeMs = Annotated[
+    Annotated[float, Field(ge=0, le=1000), Tag("<time>")] | Annotated[str, Tag("<file>")],
+    Discriminator(_compute_tag),
+]
+"""A time [ms], or the path of a file with times."""
+
+
 def _start_tag(value: Any) -> str:
     return "<word>" if isinstance(value, str) else "<time>"
 
@@ -111,7 +122,7 @@ class DirectionConfig(Section, DirectionKeys):
     blackouts: tuple[BlackoutConfig, ...] = ()
 
     _agree = model_validator(mode="after")(_refuse_conflict)
-    _write = leave_out_empty(*LATER_KEYS)
+    _write = leave_out_unset(*LATER_KEYS)
 
 
 class Profile(Section, ProfileKeys):

@@ -124,6 +124,7 @@ class ResolvedCloud(Cloud):
     estimator: PlugIn
     predictor: PlugIn
     controller: PlugIn
+    perception: PlugIn | None = None
     horizon_max_s: CloudTime = HORIZON_MAX_S
     freeze_after_s: CloudTime = FREEZE_AFTER_S
 
@@ -145,6 +146,11 @@ class ResolvedExperiment(Experiment):
     def stream(self) -> str:
         """Name of the robot's random numbers; "" for robot 0."""
         return f"robot {self.fleet.only}" if self.fleet.only else ""
+
+    @property
+    def scans(self) -> bool:
+        """Whether the robot's scanner works."""
+        return self.world.scan or self.cloud.perception is not None
 
     @model_validator(mode="after")
     def _refuse_faults(self) -> ResolvedExperiment:

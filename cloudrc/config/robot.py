@@ -30,7 +30,7 @@ from cloudrc.config.schema import (
     World,
 )
 from cloudrc.config.section import Section
-from cloudrc.messages import SENSORS_MAX
+from cloudrc.messages import RAYS_MAX, SENSORS_MAX
 from cloudrc.outside.document import read_document
 from cloudrc.outside.refusal import check_names
 from cloudrc.outside.reuse import reuse
@@ -103,6 +103,24 @@ class SensorConfig(Section):
     """Name of a sensor of the model that shows one number"""
 
 
+class ScanConfig(Section):
+    """A scanner, which measures distances in a plane, as a LIDAR does."""
+
+    site: Annotated[str, Field(min_length=1)]
+    """Name of a site of the model, from which the rays start: its x is ahead, its z is the axis of
+    the scan"""
+    rays: Annotated[int, Field(ge=2, le=RAYS_MAX)] = 181
+    """Number of rays; one datagram carries at most 541"""
+    fov_deg: Annotated[float, Field(gt=0, le=360)] = 270.0
+    """Angle that the rays cover, half of it to each side [deg]; a ray points to each of its ends"""
+    range_m: Annotated[float, Field(gt=0, le=60)] = 10.0
+    """Longest distance that the scanner sees [m]"""
+    rate_hz: Annotated[int, Field(ge=1, le=100)] = 10
+    """Number of scans per second [Hz]"""
+    noise_m: Annotated[float, Field(ge=0, le=1)] = 0.01
+    """Standard deviation of a distance, from a normal distribution [m]"""
+
+
 Sensors = Annotated[dict[SensorName, SensorConfig], Field(max_length=SENSORS_MAX)]
 
 
@@ -151,6 +169,9 @@ class RobotFiles(Section):
     sensors: Sensors = Field(default_factory=dict)
     """The robot's own sensors, at most 16: name -> unit, and sensor of the model. Telemetry carries
     their values to cloud"""
+    scan: ScanConfig | None = None
+    """The robot's scanner. It works only in an experiment that has cloud.perception or world.scan,
+    and then sends its scans to cloud. null: the robot has none"""
     hull_points: str | None = None
     """Python file with spheres in place of the ball of hull_m: its function `few` returns rows x,
     y, z, radius [m], body frame, for the distance from obstacles. null: there is none"""

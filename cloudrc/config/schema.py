@@ -28,8 +28,8 @@ from pydantic import (
 from cloudrc.config.disturbances import Plant, SensorsConfig, WindConfig
 from cloudrc.config.faults import FaultConfig
 from cloudrc.config.fleet import CellConfig, FleetConfig
-from cloudrc.config.profile import CloudTime, CommandAge, DirectionConfig, StartConfig
-from cloudrc.config.section import Section, leave_out_empty
+from cloudrc.config.profile import CloudTime, CommandAge, ComputeMs, DirectionConfig, StartConfig
+from cloudrc.config.section import Section, leave_out_unset
 from cloudrc.geometry.fence import Corners, order_of
 from cloudrc.link.profile import NotNegative as NotNegative
 from cloudrc.link.profile import Positive as Positive
@@ -263,8 +263,13 @@ class World(Section):
     wind: WindConfig = WindConfig()
     """Horizontal wind. It acts on the actuators alone, by their drag, so it does not move a robot
     whose actuators are off. A robot whose actuators have no drag is refused"""
+    scan: bool = False
+    """Whether the robot's scanner works without a cloud.perception, too: the scans then go to the
+    recording alone"""
     odometry_rate_hz: Literal[20, 25, 50, 100, 125, 250, 500] = 100
     """Rate of the odometry for cloud [Hz]. The true state is recorded at 100 Hz or more"""
+
+    _write = leave_out_unset("scan")
 
     @field_validator("fence_m")
     @classmethod
@@ -328,7 +333,7 @@ class Link(Section):
     """Where in the time line of the link the flight begins [s], or random: drawn from the seed, and
     the line goes round. null: the profile's value, else 0"""
 
-    _write = leave_out_empty("start_s")
+    _write = leave_out_unset("start_s")
 
     @model_validator(mode="after")
     def _refuse_start(self) -> Link:
@@ -353,16 +358,6 @@ ComputeSpeed = Annotated[float, Field(ge=0.01, le=100)]
 """Speed of a processor, as a multiple of that of the reference."""
 
 
-def _compute_tag(value: Any) -> str:
-    return "<file>" if isinstance(value, str) else "<time>"
-
-
-ComputeMs = Annotated[
-    Annotated[float, Field(ge=0, le=1000), Tag("<time>")] | Annotated[str, Tag("<file>")],
-    Discriminator(_compute_tag),
-]
-
-
 class Cloud(Section):
     """The remote controller."""
 
@@ -373,6 +368,12 @@ class Cloud(Section):
     parameters"""
     controller: PlugInChoice = "pid"
     """Tracks the setpoint: a name, or a mapping with parameters"""
+    perception: PlugInChoice | None = None
+    """Makes setpoints of what the robot's scanner sees, while a mission flies: a name, or a mapping
+    with parameters. Teleop's waypoints then say only when the mission is over. null: none"""
+    perception_ms: ComputeMs = 0.0
+    """Emulated computing time of perception for one scan [ms], as compute_ms. It has a core of its
+    own: commands do not wait for it, and scans that arrive meanwhile replace each other"""
     plan_s: PlanTime = 0.0
     """Length of the plan in each command [s], with velocities in steps of 10 ms. The robot
     follows the plan while newer commands are late or lost. A plan needs a predictor with a model;
@@ -429,7 +430,7 @@ class Cloud(Section):
     """How the clouds share cores. fifo: one computation after the other; ps: processor sharing, all
     at the same time, each more slowly"""
 
-    _write = leave_out_empty("answers")
+    _write = leave_out_unset("answers", "perception", "perception_ms")
 
     @model_validator(mode="after")
     def _check_compute(self) -> Cloud:
@@ -439,6 +440,8 @@ class Cloud(Section):
         mean = self.compute_ms if isinstance(self.compute_ms, float) else 0.0
         if self.compute_deviation_ms > 0 and not mean:
             raise ValueError("compute_deviation_ms needs compute_ms, the mean, above 0")
+        if self.perception is None and self.perception_ms:
+            raise ValueError("perception_ms needs perception")
         if self.cpu_share < 1 and not (self.compute_ms or self.compute_measured):
             raise ValueError("cpu_share needs compute_ms above 0 or compute_measured")
         if self.send_delta_mps is not None and not self.plan_s:
@@ -497,4 +500,4 @@ class Experiment(Section):
     faults: tuple[FaultConfig, ...] = ()
     """Faults that are injected in flight, in any order"""
 
-    _write = leave_out_empty("faults")
+    _write = leave_out_unset("faults")

@@ -59,18 +59,16 @@ class Described(BaseModel):
         return schema
 
 
-def leave_out_empty(*keys: str) -> Any:
-    """Let a section leave out these keys where they are null, () or at their default.
-
-    So the hash of a file from before them stays.
-    """
+def leave_out_unset(*keys: str) -> Any:
+    """Let a section leave out these keys where they have their default, so that its hash stays."""
 
     def write(self: BaseModel, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         written: dict[str, Any] = handler(self)
+        fields = type(self).model_fields
         return {
             key: value
             for key, value in written.items()
-            if key not in keys or value not in (None, (), [], type(self).model_fields[key].default)
+            if key not in keys or getattr(self, key) != fields[key].default
         }
 
     return model_serializer(mode="wrap")(write)

@@ -47,8 +47,12 @@ class RecordSender:
 
     def see(self, epoch: int, counter: int, telemetry: Telemetry) -> None:
         """Send telemetry that cloud uses; datagrams of it have `epoch` and `counter`."""
+        self.show(TelemetrySent(telemetry.stamp_ns, epoch, counter, telemetry))
+
+    def show(self, record: Record) -> None:
+        """Send a record at once, such as one of world that cloud knows from a datagram."""
         if self._sent:
-            self._send([to_line(TelemetrySent(telemetry.stamp_ns, epoch, counter, telemetry))])
+            self._send([to_line(record)])
 
     def put(self, records: Iterable[Record]) -> None:
         """Send records, oldest first; look for new readers now and then."""

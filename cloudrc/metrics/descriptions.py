@@ -185,6 +185,14 @@ _add(
     *((f"budget_{_stage}", "s", f"Mean of a stage of the age: {_words}. Of the commands that the "
        "robot followed.") for _stage, _words in AGE_STAGES.items()),
 )  # fmt: skip
+_add(
+    "Perception",
+    ("seen_to_acted", "s", "Mean time from a scan until the robot acts on it: uplink, perception, "
+     "command and downlink."),
+    ("seen_to_acted_p99", "s", "99th percentile of the time from a scan until the robot acts on "
+     "it."),
+    ("seen_dropped", "1", "Number of scans in whose place the perception took newer ones."),
+)  # fmt: skip
 for _way, _words in WAYS.items():
     _add(
         "Link and loop",

@@ -47,7 +47,7 @@ SETTLING_NS = 10_000_000_000
 is no steady error.
 Source: docs/reference/control.md, "Steady state": the slowest variant that settles needs 8 to 15 s
 to stay within 1 cm."""
-FAILURES = ("estimator_failed", "predictor_failed", "controller_failed")
+FAILURES = ("estimator_failed", "predictor_failed", "controller_failed", "perception_failed")
 """Counters of cloud that are included in the number of faults."""
 
 

@@ -365,13 +365,14 @@ def _restarts(flight: Flight, kills: int) -> Iterator[FlightFailure]:
 def plugin_failures(
     recording: Recording, span_ns: tuple[int, int] | None
 ) -> Iterator[FlightFailure]:
-    """Yield a failure for each plug-in that failed in too many control periods.
+    """Yield a failure for each plug-in that failed in too many control periods, or for scans.
 
     `span_ns` are the begin and the end of the time that counts [ns], or None for all.
     """
-    periods = between(recording["/delay_estimate"].columns, *(span_ns or (0, inf)))
-    faults = recording["/fault"]
-    for kind in ("estimator", "predictor", "controller"):
+    faults, calls = recording["/fault"], {"perception": "/perception"}
+    for kind in ("estimator", "predictor", "controller", "perception"):
+        topic = recording[calls.get(kind, "/delay_estimate")].columns
+        periods = between(topic, *(span_ns or (0, inf)))
         failed = growth(recording, f"{kind}_failed", span_ns)
         share = (failed or 0.0) / max(len(periods["stamp_ns"]), 1)
         if share > PLUGIN_FAILURES_MAX:

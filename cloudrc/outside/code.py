@@ -20,13 +20,13 @@ import os
 import sys
 import sysconfig
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from importlib.machinery import PathFinder
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from cloudrc.errors import (
     BadInputError,
@@ -79,6 +79,14 @@ def apart() -> Iterator[None]:
     """Call users' code inside the block: what it prints goes to stderr."""
     with redirect_stdout(sys.stderr):
         yield
+
+
+def attempt(call: Callable[[], Any]) -> tuple[Any, BaseException | None]:
+    """Call users' code; return its result and its failure, one of which is None."""
+    try:
+        return call(), None
+    except FAILURES as error:
+        return None, error
 
 
 @contextmanager

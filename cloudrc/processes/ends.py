@@ -18,6 +18,7 @@ from cloudrc.config.compute import check_unshared
 from cloudrc.config.load import load_experiment, read_experiment, robot_settings
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import known_robot
+from cloudrc.drivers.background import Background
 from cloudrc.drivers.channels import find_channel
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.link_monitor import LinkMonitor
@@ -27,6 +28,7 @@ from cloudrc.drivers.readers import RecordSender
 from cloudrc.drivers.realtime import Address, Peer, bind, show_address
 from cloudrc.drivers.teleop import RemoteTeleop, UnixDatagrams, UnixPeer
 from cloudrc.files import warn_if_readable, write_atomically
+from cloudrc.geometry.rays import scan_record
 from cloudrc.link.follow import PEER_PAUSE, PeerName
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import link_profile
@@ -101,9 +103,16 @@ def run_cloud(
     ):
         teleop = RemoteTeleop(peer, time.monotonic_ns())
         cloud = assembly.build_cloud(
-            experiment, identity, teleop, time.monotonic_ns, channel=channel
+            experiment,
+            identity,
+            teleop,
+            time.monotonic_ns,
+            channel=channel,
+            make_worker=lambda extra: Background(extra.end if extra else None),
         )
         end.readers, cloud.watch = readers, readers.see
+        if (scan := known_robot(experiment.world.robot).scan) is not None:
+            cloud.watch_scan = lambda *sent: readers.show(scan_record(scan, *sent))
 
         def flies() -> bool:
             return cloud.guard is GuardState.TRACK

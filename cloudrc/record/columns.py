@@ -41,6 +41,7 @@ _TYPES: dict[Kind, tuple[type, tuple[int, ...]]] = {
     "string": (np.object_, ()),
     "vector": (np.float64, (3,)),
     "quaternion": (np.float64, (4,)),
+    "floats": (np.float64, ()),  # the rows say how many
 }
 
 
@@ -48,7 +49,7 @@ class Table:
     """The n rows of one topic as columns.
 
     Integers are stored as int64, floats and vectors as float64, truth values as bool, strings as
-    object. The shape is (n, 3) for vectors, (n, 4) for quaternions, and (n,) for other columns.
+    object. The shape is (n, 3) for vectors, (n, 4) for quaternions, (n, m) for m floats, else (n,).
     The columns are read-only, because all metrics and the report share them.
     """
 
@@ -71,6 +72,9 @@ class Table:
 
 def _column(kind: Kind, values: Any) -> Column:
     dtype, shape = _TYPES[kind]
+    if kind == "floats":
+        values = np.stack(values) if len(values) else np.empty((0, 1))
+        shape = values.shape[1:]
     if dtype is not np.object_ and not isinstance(values, np.ndarray):  # asarray takes longer
         values = np.fromiter(chain.from_iterable(values) if shape else values, dtype)
     column: Column = np.asarray(values, dtype=dtype).reshape(-1, *shape)

@@ -4,7 +4,8 @@
 
 ROS stores quaternions as `xyzw` and the velocity of an odometry in the body frame; cloudrc uses
 `wxyz` and the world frame. Only this module converts between them. Every message begins with a
-`std_msgs/Header`, which contains the row's stamp; the frames are `world` and `base_link`.
+`std_msgs/Header`, which contains the row's stamp; the frames are `world`, `base_link` and
+`lidar`.
 
 The message types in `cloudrc_msgs` are generated from `cloudrc/record/topics.py`, with a comment
 and a unit for each field. All other types are standard ROS types. The package rosbags parses,
@@ -28,6 +29,8 @@ from cloudrc.messages import Quaternion, Vector
 from cloudrc.record.topics import TOPICS, Kind, Row, Topic, Values
 
 _OURS = "cloudrc_msgs/"
+SCAN, LIDAR = "sensor_msgs/msg/LaserScan", "lidar"
+"""Type of a scan, and its frame, that of the scanner."""
 _ROS_NAMES: dict[Kind, str] = {
     "int": "int64",
     "float": "float64",
@@ -196,6 +199,11 @@ def _parse_odometry(message: Any) -> Values:
     return _xyz(pose.position), wxyz, rotate(wxyz, _xyz(twist.linear)), _xyz(twist.angular)
 
 
+def _parse_scan(scan: Any) -> Values:
+    shape = scan.angle_min, scan.angle_increment, scan.scan_time, scan.range_max
+    return *shape, scan.ranges.tolist()
+
+
 def _xyz(vector: Any) -> Vector:
     return vector.x, vector.y, vector.z
 
@@ -205,6 +213,7 @@ _PARSERS: dict[str, _Parse] = {
     "nav_msgs/msg/Odometry": _parse_odometry,
     "geometry_msgs/msg/TwistStamped": lambda message: twist_of(message.twist),
     "geometry_msgs/msg/PointStamped": lambda message: (_xyz(message.point),),
+    SCAN: _parse_scan,
 }
 """Standard ROS type -> function to decode it; a topic may use only its first fields."""
 
@@ -253,6 +262,8 @@ def _packer(topic: Topic) -> Callable[[Row], bytes] | None:
     rosbags would need ten times as long, for 40,000 messages of a flight of half a minute.
     """
     kinds = [field.kind for field in topic.fields]
+    if topic.ros_type == SCAN:
+        return pack_scan
     if "string" in kinds:
         return None
     layout, numbers = _FIXED.get(topic.ros_type) or (_layout(kinds), partial(_numbers, kinds))
@@ -260,6 +271,14 @@ def _packer(topic: Topic) -> Callable[[Row], bytes] | None:
     return lambda row: pack(
         b"\0\1\0\0", *divmod(row[0], _SECOND_NS), 6, b"world", *numbers(row[1:])
     )
+
+
+def pack_scan(row: Row, frame: str = LIDAR) -> bytes:
+    """Encode a row of /scan as a sensor_msgs/LaserScan whose scanner has this frame."""
+    stamp_ns, angle_min, step, period, range_max, ranges = row
+    angles = angle_min, angle_min + step * (len(ranges) - 1), step
+    arrays = np.float32(ranges), np.empty(0, np.float32)  # intensities: none
+    return pack(SCAN, header(stamp_ns, frame), *angles, 0.0, period, 0.0, range_max, *arrays)
 
 
 def _layout(kinds: Iterable[Kind]) -> str:

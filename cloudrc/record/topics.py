@@ -28,7 +28,7 @@ from cloudrc import records as rec
 from cloudrc.messages import Cause, GuardState, Quaternion, Vector
 from cloudrc.records import Record
 
-Kind: TypeAlias = Literal["int", "float", "bool", "string", "vector", "quaternion"]
+Kind: TypeAlias = Literal["int", "float", "bool", "string", "vector", "quaternion", "floats"]
 Values: TypeAlias = tuple[Any, ...]
 Row: TypeAlias = tuple[Any, ...]
 """Stamp [ns] on the clock of the recording end (world or cloud), then the values of the fields."""
@@ -38,7 +38,7 @@ class Field(NamedTuple):
     """A column of a topic, which holds one value per row."""
 
     name: str  # name of the column and of the ROS field
-    kind: Kind  # kind of a value; vectors have shape (3,), quaternions (4,)
+    kind: Kind  # kind of a value; vectors have shape (3,), quaternions (4,), floats any (n,)
     unit: str  # unit of the values; "" without a unit
     text: str  # meaning of the values
     path: str  # dotted path of the value in the record
@@ -97,6 +97,7 @@ _KINDS: dict[Any, Kind] = {
     str: "string",
     Vector: "vector",
     Quaternion: "quaternion",
+    rec.Numbers: "floats",
 }
 
 
@@ -127,6 +128,8 @@ _TABLE = (
     Topic("/sensor", "cloudrc_msgs/msg/SensorRead", rec.SensorRead, "world",
         "Value of one of the robot's own sensors, world's clock. Telemetry carries it to cloud",
         also=(rec.ContactForce, "stamp_ns sensor.name sensor.unit force")),
+    Topic("/scan", "sensor_msgs/msg/LaserScan", rec.ScanTaken, "world",
+        "Distances that the robot's scanner measured, as sent to cloud, world's clock"),
     Topic("/reference", "geometry_msgs/msg/TwistStamped", rec.GroundTruth, "world",
         "Velocity that the guard lets the onboard controller follow, world's clock", "reference"),
     Topic("/energy", "cloudrc_msgs/msg/EnergyUsed", rec.EnergyUsed, "world",
@@ -165,6 +168,8 @@ _TABLE = (
         "A command left cloud, cloud's clock. Only if a computation takes simulated time"),
     Topic("/cell_wait", "cloudrc_msgs/msg/CellWait", rec.CellWait, "world",
         "A datagram left the radio cell, world's clock. Only in virtual time, with a cell"),
+    Topic("/perception", "cloudrc_msgs/msg/Perceived", rec.Perceived, "cloud",
+        "What became of a scan at cloud's perception, cloud's clock"),
     Topic("/mission", "cloudrc_msgs/msg/MissionEvent", rec.MissionEvent, "cloud",
         "An event of the mission, cloud's clock"),
     Topic("/fault", "cloudrc_msgs/msg/Fault", rec.Fault, "either",
@@ -185,7 +190,7 @@ _TABLE = (
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 """Name -> topic, for every topic of a recording."""
 
-ADDED = ("/plan", "/sensor")
+ADDED = ("/plan", "/sensor", "/scan", "/perception")
 """Topics that came later than the others; without rows they do not change a hash."""
 UNHASHED = ("/energy", "/left", "/cell_wait")
 """Topics that never change a hash: flights from before them keep theirs."""

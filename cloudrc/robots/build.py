@@ -82,6 +82,8 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
         sensors = find_sensors(nominal, robot.sensors)
         if robot.probe is not None:
             find_part(nominal, "site", robot.probe, "probe")
+        if robot.scan is not None:
+            find_part(nominal, "site", robot.scan.site, "scan.site")
     judges = not (is_direct or plugin.is_shipped)
     with plugin.calling("actuators" if judges else "build"):
         simulator = Simulator(model, actuators, wind, robot.probe, sensors, judges=judges)

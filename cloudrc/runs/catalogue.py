@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from cloudrc.text import Paint, plain, table
 
-PLUGINS = ("estimators", "predictors", "controllers", "onboard", "metrics")
+PLUGINS = ("estimators", "predictors", "controllers", "perceptions", "onboard", "metrics")
 YAML = ("experiments", "missions", "places", "profiles", "robots")
 XML = ("scenes",)
 KINDS = (*YAML, *PLUGINS, *XML)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cloudrc import assembly
-from cloudrc.cloud.endpoint import ComputeTime
+from cloudrc.cloud.compute_time import ComputeTime
 from cloudrc.drivers.cpu_limit import PacedClock, cpu_limit
 from cloudrc.errors import NothingFlownError
 from cloudrc.messages import plan_length

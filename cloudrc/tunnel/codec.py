@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.messages import (
     NEVER_NS,
+    RAYS_MAX,
     SENSORS_MAX,
     TOUCH_NAME_MAX,
     Cause,
@@ -27,13 +28,14 @@ from cloudrc.messages import (
     Odometry,
     OperatorRequest,
     Passed,
+    RangeScan,
     Request,
     Start,
     Telemetry,
     Vector,
 )
 
-VERSION = 7  # of the wire format; a release of cloudrc refuses all other versions
+VERSION = 8  # of the wire format; a release of cloudrc refuses all other versions
 PLAN_MAX = 80  # largest number of velocities in a command's plan
 DATAGRAM_MAX = 1200  # size of the receive buffer; valid datagrams fit into one packet [bytes]
 NUMBER_MAX = 2**32 - 1  # highest number of an operator request
@@ -54,6 +56,7 @@ class Kind(IntEnum):
     COMMAND = 6
     OPERATOR = 7
     ALIVE = 8
+    SCAN = 9
 
 
 class Direction(IntEnum):
@@ -99,9 +102,10 @@ _BODIES = {
     Kind.COMMAND: struct.Struct("<qqq3dd"),
     Kind.OPERATOR: struct.Struct("<IBBQHq"),
     Kind.ALIVE: struct.Struct(""),
+    Kind.SCAN: struct.Struct("<q"),
 }
 _TELEMETRY, _COMMAND = _BODIES[Kind.TELEMETRY], _BODIES[Kind.COMMAND]
-_OPERATOR = _BODIES[Kind.OPERATOR]
+_OPERATOR, _SCAN = _BODIES[Kind.OPERATOR], _BODIES[Kind.SCAN]
 BODY_SIZES = {kind: body.size for kind, body in _BODIES.items()}
 LAST_GREETING = int(Kind.BUSY)
 HEADER_SIZE, TAG_SIZE = _HEADER.size, 16
@@ -118,10 +122,13 @@ COMMAND_SIZES = tuple(
 """Number of velocities in a command's plan -> size of the datagram [bytes]."""
 TELEMETRY_SIZES = tuple(SIZES[Kind.TELEMETRY] + each.size for each in _SENSORS)
 """Number of the robot's own sensors -> size of a datagram of telemetry [bytes]."""
+SCAN_SIZES = tuple(SIZES[Kind.SCAN] + 2 * n for n in range(RAYS_MAX + 1))
+"""Number of rays -> size of a datagram with their distances [bytes]."""
 _sizes_of: dict[int, Container[int]] = {
     **{kind: (size,) for kind, size in SIZES.items()},
     int(Kind.TELEMETRY): frozenset(TELEMETRY_SIZES),
     int(Kind.COMMAND): frozenset(COMMAND_SIZES),
+    int(Kind.SCAN): frozenset(SCAN_SIZES),
     int(Kind.OPERATOR): range(SIZES[Kind.OPERATOR], SIZES[Kind.OPERATOR] + TOUCH_NAME_MAX + 1),
 }
 """Kind -> valid sizes of its datagrams [bytes]."""
@@ -227,6 +234,18 @@ def decode_command(body: bytes) -> Command:
         plan = tuple(_VELOCITY.iter_unpack(body[size + _PLANNED.size :]))
     fields = (stamp_ns, basis_stamp_ns, basis_hold_ns, (x, y, z), yaw_rate, plan, planned_ns)
     return _new(Command, fields)
+
+
+def encode_scan(scan: RangeScan) -> bytes:
+    """Encode the body of a SCAN datagram."""
+    stamp_ns, millimetres = scan
+    return struct.pack(f"<q{len(millimetres)}H", stamp_ns, *millimetres)
+
+
+def decode_scan(body: bytes) -> RangeScan:
+    """Decode the body of a SCAN datagram."""
+    stamp_ns, *millimetres = struct.unpack(f"<q{(len(body) - _SCAN.size) // 2}H", body)
+    return RangeScan(stamp_ns, tuple(millimetres))
 
 
 def encode_operator(request: OperatorRequest) -> bytes:

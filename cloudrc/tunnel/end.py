@@ -5,17 +5,24 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from cloudrc.messages import Command, Datagram, Passed, Telemetry
+from cloudrc.messages import Command, Datagram, Passed, RangeScan, Telemetry
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import ReceiveWindow
-from cloudrc.tunnel.codec import Direction, encode_command, encode_telemetry
+from cloudrc.tunnel.codec import Direction, encode_command, encode_scan, encode_telemetry
 from cloudrc.tunnel.handshake import KEY_TEXT, VERSION_TEXT
 from cloudrc.tunnel.keys import KeyRing
 from cloudrc.tunnel.session import Session
+
+_ENCODERS: dict[type, Callable[[Any], bytes]] = {
+    Telemetry: encode_telemetry,
+    Command: encode_command,
+    RangeScan: encode_scan,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +96,8 @@ class TunnelEnd:
     def _send(self, kind: int, body: bytes) -> None:
         self._queue(self._session.seal(kind, body))
 
-    def _encode(self, kind: int, message: Telemetry | Command) -> bytes:
-        encode: Any = encode_command if isinstance(message, Command) else encode_telemetry
-        return self._session.seal(kind, encode(message))
+    def _encode(self, kind: int, message: Telemetry | Command | RangeScan) -> bytes:
+        return self._session.seal(kind, _ENCODERS[type(message)](message))
 
     def _queue(self, datagram: Datagram) -> None:
         self._datagrams.append(datagram)

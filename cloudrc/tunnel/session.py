@@ -19,6 +19,7 @@ from cloudrc.tunnel.codec import (
     COMMAND_SIZES,
     HEADER_SIZE,
     LAST_GREETING,
+    SCAN_SIZES,
     TAG_SIZE,
     TELEMETRY_SIZES,
     DecodeError,
@@ -29,7 +30,7 @@ from cloudrc.tunnel.codec import (
 )
 from cloudrc.tunnel.keys import Key, KeyRing
 
-COMMAND = int(Kind.COMMAND)  # looked up for each message
+COMMAND, SCAN = int(Kind.COMMAND), int(Kind.SCAN)  # looked up for each message
 NO_EPOCH = 0  # epoch of an end without a session, and of every HELLO, CHALLENGE and BUSY datagram
 TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}  # kinds without a session
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
@@ -74,7 +75,7 @@ class Session:
         return header + self._sealing.encrypt(header[4:], body, header)
 
     def pass_on(self, kind: int, message: Any) -> Passed:
-        """Give telemetry or a command the counter of its next datagram, without encryption.
+        """Give telemetry, a command or a scan the counter of its next datagram, unencrypted.
 
         Use this method in place of `seal` only if the receiver is in the same process: the result
         is a Python object, not bytes.
@@ -84,6 +85,8 @@ class Session:
         counters[kind] = counter + 1
         if kind == COMMAND:
             size = COMMAND_SIZES[len(message.plan)]
+        elif kind == SCAN:
+            size = SCAN_SIZES[len(message.millimetres)]
         else:
             size = TELEMETRY_SIZES[len(message.sensors)]
         return _new(Passed, (kind, self.epoch, counter, message, size))

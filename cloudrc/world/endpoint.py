@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from math import hypot, isnan, nan
 
+from cloudrc.geometry.rays import scan_record
 from cloudrc.geometry.scene import is_obstacle
 from cloudrc.messages import (
     NEVER_NS,
@@ -42,12 +43,13 @@ from cloudrc.records import (
     SessionOpened,
     TelemetrySent,
 )
+from cloudrc.sim.scan import Scanner
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED
 from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
 from cloudrc.tunnel.handshake import ServerHandshake
-from cloudrc.world.robot import Robot
+from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.sensors import Sensors
 
 START_AGE_MAX_NS = 1_000_000_000
@@ -62,7 +64,9 @@ COUNT_PERIOD_NS = 1_000_000_000
 """Time between two records of the counters [ns]."""
 SLOW_TEXT = "simulated time is slower than real time; give world more processor time"
 TRACK = GuardState.TRACK  # looking up a member of an enum is slow
-COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
+COMMAND, TELEMETRY, SCAN = int(Kind.COMMAND), int(Kind.TELEMETRY), int(Kind.SCAN)  # looked up often
+NO_SCAN_NS = 1 << 63
+"""Time of the next scan if there is none [ns]: later than any clock shows."""
 _new = tuple.__new__  # makes a named tuple in half the time of its own constructor
 
 
@@ -78,12 +82,14 @@ class WorldEndpoint(TunnelEnd):
         newest_wins: bool,
         odometry_period_ns: int = ODOMETRY_PERIOD_NS,
         start_ns: int = 0,
+        scanner: Scanner | None = None,
     ) -> None:
         """Connect a robot that is switched off to the tunnel; there is no session yet.
 
         With `newest_wins`, a command that arrives after a newer command is dropped.
         `odometry_period_ns` is the time between two odometry samples [ns], a multiple of the step.
-        `start_ns` is the present time on the monotonic clock [ns].
+        `start_ns` is the present time on the monotonic clock [ns]. Without a `scanner`, no scans
+        are sent.
         """
         counts = robot.guard.counts
         super().__init__(identity, Direction.UPLINK, counts, newest_wins=newest_wins)
@@ -97,6 +103,8 @@ class WorldEndpoint(TunnelEnd):
         self._odometry_period_ns = odometry_period_ns
         self._sample_period_ns = min(odometry_period_ns, ODOMETRY_PERIOD_NS)
         self._count_ns = start_ns + COUNT_PERIOD_NS
+        self._scanner, self._scan_ns = scanner, NO_SCAN_NS
+        self._scans, self._scans_from_ns = 0, start_ns  # number in this session, its beginning
         self._counted_slip_ns: int | None = None
         self._waiting: tuple[int, int, Command] | None = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
@@ -120,8 +128,9 @@ class WorldEndpoint(TunnelEnd):
         return self._slip_ns
 
     def next_deadline_ns(self) -> int:
-        """Return when the next sample of the true state is due [ns], monotonic clock."""
-        return self._sample_ns + self._slip_ns
+        """Return when the next sample of the true state or scan is due [ns], monotonic clock."""
+        sample_ns, scan_ns = self._sample_ns, self._scan_ns
+        return (sample_ns if sample_ns < scan_ns else scan_ns) + self._slip_ns
 
     def handle_deadline(self, now_ns: int) -> None:
         """Simulate up to `now_ns` [ns]; send the telemetry that is due."""
@@ -169,7 +178,7 @@ class WorldEndpoint(TunnelEnd):
     def _advance(self, until_ns: int, *, samples: bool = False) -> None:
         """Simulate all steps that begin before `until_ns` [ns], world's clock.
 
-        With `samples`, also take the sample of the true state that is due at `until_ns`.
+        With `samples`, also take the sample of the true state and the scan due at `until_ns`.
 
         If an earlier call has taken this sample, also simulate the step that begins at `until_ns`.
         So a datagram that arrives at the time of a sample acts from the next step on.
@@ -182,11 +191,14 @@ class WorldEndpoint(TunnelEnd):
         while tick_ns < until_ns:
             if tick_ns >= self._sample_ns:
                 self._sample(tick_ns)
-            sample_ns = self._sample_ns
-            stop_ns = sample_ns if sample_ns < until_ns else until_ns
+            if tick_ns >= self._scan_ns:
+                self._scan(tick_ns)
+            stop_ns = min(self._sample_ns, self._scan_ns, until_ns)
             tick_ns = self._tick_ns = self._run_robot(tick_ns, stop_ns)
         if samples and tick_ns == self._sample_ns:
             self._sample(tick_ns)
+        if samples and tick_ns == self._scan_ns:
+            self._scan(tick_ns)
 
     def _apply(self, now_ns: int) -> None:
         assert self._waiting is not None
@@ -225,6 +237,18 @@ class WorldEndpoint(TunnelEnd):
         if now_ns >= self._count_ns:
             self._record_counts(now_ns)
         self._sample_ns += self._sample_period_ns
+
+    def _scan(self, now_ns: int) -> None:
+        """Scan and send the distances; the next scan is due at the first step of its period."""
+        scanner = self._scanner
+        assert scanner is not None, "only a scanner has a time"
+        self._scans += 1
+        steps = -(-self._scans * 1_000_000_000 // (scanner.config.rate_hz * STEP_NS))
+        self._scan_ns = self._scans_from_ns + steps * STEP_NS
+        scan = scanner.measure(now_ns)
+        epoch, counter = self._session.epoch, self._session.next_counter(SCAN)
+        self._queue(self._make_datagram(SCAN, scan))
+        self._records.append(scan_record(scanner.config, epoch, counter, scan))
 
     def _record_events(self, now_ns: int) -> None:
         """Record a failure of the onboard controller, changes of the guard's state and contacts."""
@@ -297,6 +321,8 @@ class WorldEndpoint(TunnelEnd):
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
         self._told.clear()
         epoch, now_ns = self._session.epoch, self._tick_ns
+        if self._scanner is not None:
+            self._scans, self._scans_from_ns, self._scan_ns = 0, now_ns, now_ns
         self._records.append(SessionOpened(now_ns, "world", epoch, cause))
         for observer in self.robot.observers:
             observer.see_session(now_ns)

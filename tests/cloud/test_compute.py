@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cloudrc.assembly import assemble
-from cloudrc.cloud.endpoint import ComputeTime
+from cloudrc.cloud.compute_time import ComputeTime
 from cloudrc.config.load import load_experiment
 from cloudrc.records import Arrival, Control, Fault
 from tests.flights.conftest import fly_on

@@ -5,15 +5,17 @@
 import importlib
 import inspect
 import pkgutil
-from math import isfinite, pi, sqrt
+from math import inf, isfinite, pi, sqrt
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.cloud import controllers, estimators, predictors
+from cloudrc.cloud import controllers, estimators, perceptions, predictors
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
+from cloudrc.cloud.perceptions import Perception, Scan
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.config.overrides import OUTSIDE
 from cloudrc.config.robot import facts
@@ -21,7 +23,12 @@ from cloudrc.config.schema import World
 from cloudrc.messages import UPRIGHT, ZERO, Command, Odometry, Setpoint
 
 PELICAN = facts(World(), 12.0)
-KINDS = {estimators: Estimator, predictors: Predictor, controllers: Controller}
+KINDS = {
+    estimators: Estimator,
+    predictors: Predictor,
+    controllers: Controller,
+    perceptions: Perception,
+}
 
 
 def discover(package):
@@ -41,6 +48,7 @@ every_plugin = pytest.mark.parametrize(
     ("module", "kind"), PLUGINS, ids=[short(module) for module, _ in PLUGINS]
 )
 every_estimator = pytest.mark.parametrize("module", discover(estimators), ids=short)
+every_perception = pytest.mark.parametrize("module", discover(perceptions), ids=short)
 every_predictor = pytest.mark.parametrize("module", discover(predictors), ids=short)
 OWN = [
     module for module in discover(controllers) if module.__name__.rpartition(".")[2] not in OUTSIDE
@@ -201,3 +209,39 @@ def test_a_controller_forgets_everything_when_it_is_reset(module):
     used.reset()
     setpoint = Setpoint((-1.0, 2.0, 0.5))
     assert used.update(estimate, setpoint, 0.01) == fresh.update(estimate, setpoint, 0.01)
+
+
+scans = st.integers(2, 541).flatmap(
+    lambda rays: st.lists(
+        st.one_of(st.floats(0.001, 60.0), st.just(inf)), min_size=rays, max_size=rays
+    )
+)
+
+
+@every_perception
+@given(ranges=scans, fov=st.floats(0.1, 2 * pi), sample=odometry)
+@fewer
+def test_a_setpoint_is_finite_and_equal_scans_give_equal_ones(module, ranges, fov, sample):
+    """Also where nothing is within range, or something on all sides."""
+    angles = np.linspace(-fov / 2, fov / 2, len(ranges))
+    scan = Scan(sample.stamp_ns, np.array(ranges), angles)
+    before = scan.ranges.copy()
+    first, again = (build(module).see(scan, sample) for _ in range(2))
+    assert (scan.ranges == before).all(), "others may use the scan, too"
+    assert first == again
+    if first is not None:
+        assert are_finite(first.position, first.velocity, (first.yaw, first.yaw_rate))
+
+
+@every_perception
+def test_a_perception_forgets_everything_when_it_is_reset(module):
+    used, fresh = build(module), build(module)
+    angles = np.linspace(-2.0, 2.0, 9)
+    for k in range(10):
+        sample = Odometry(k * 10**8, (0.1 * k, 0.0, 0.0), UPRIGHT, ZERO, ZERO)
+        used.see(Scan(sample.stamp_ns, np.full(9, 1.0 + k), angles), sample)
+    used.reset()
+    for k in range(3):
+        sample = Odometry(k * 10**8, ZERO, UPRIGHT, ZERO, ZERO)
+        scan = Scan(sample.stamp_ns, np.linspace(1.0, 5.0 + k, 9), angles)
+        assert used.see(scan, sample) == fresh.see(scan, sample)

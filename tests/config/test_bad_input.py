@@ -42,8 +42,8 @@ def test_all_problems_are_listed_with_their_lines(mine):
         "mine.yaml:1: seed: 'one': must be a valid whole number",
         "mine.yaml:2: guard.speed_max: unknown key; did you mean speed_max_mps [m/s]?",
         "mine.yaml:3: link.uplink.delay_ms: -3: must be >= 0 [ms]",
-        "mine.yaml:4: world.scene: no scene named 'pipe'; available: empty, pillars, pipes; "
-        "did you mean pipes?; for one of your own, give its path, such as ./pipe",
+        "mine.yaml:4: world.scene: no scene named 'pipe'; available: corridor, empty, pillars, "
+        "pipes; did you mean pipes?; for one of your own, give its path, such as ./pipe",
     ])  # fmt: skip
     text = "cloud:\n  predictor: last_sampel\n  controller: {name: pid, sped_max: 2}\n"
     found = refused_text(mine, text)

@@ -36,6 +36,8 @@ def test_every_key_is_described_and_dumped():
         "link.start_s",
         "cloud.answers",
         "faults",
-    ]  # left out where they are empty
+        "world.scan",
+        "cloud.perception",
+    ]  # left out where they have their default
     for key in FORMS:
         assert any(part in key for part in optional) or f"{key.rpartition('.')[2]}:" in text, key

@@ -329,7 +329,7 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
     assert (notes, list(numbers)) == ([], sorted(numbers))
     resting = {f"steady_error_{axis}" for axis in "xyz"}
     others = {"recorder_dropped", "final_error", "controller_gaps", "yaw_error", "age_violation"}
-    others |= {"commands_withheld"}
+    others |= {"commands_withheld", "seen_dropped", "seen_to_acted", "seen_to_acted_p99"}
     others |= {f"budget_{name}" for name in ("uplink_cell", "compute", "downlink_cell")}
     assert set(SHIPPED) - set(numbers) == REAL_TIME | OF_RELAYS | resting | others
     for name, number in numbers.items():

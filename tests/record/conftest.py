@@ -28,6 +28,7 @@ CLASSES = get_args(Record)
 _stamps = st.integers(0, 2**31 * SECOND - 1)
 _integers = st.integers(-(2**63), 2**63 - 1)
 _metres = st.floats(-1e6, 1e6)
+_singles = st.floats(-100.0, 100.0, width=32)
 _directions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1)
 
 
@@ -40,6 +41,8 @@ def _strategy(name, kind):
         return instances(kind)
     if kind == rec.SensorLabel | None:
         return st.none() | instances(rec.SensorLabel)
+    if kind == rec.Numbers:  # as many in each record
+        return st.lists(_singles, min_size=3, max_size=3)
     if get_origin(kind) is tuple:
         return st.tuples(*[_metres] * 3) if len(get_args(kind)) == 3 else _directions.map(_unit)
     if get_origin(kind) is Literal:
@@ -54,6 +57,9 @@ def _strategy(name, kind):
 def instances(cls):
     """Generate random records of a class."""
     hints = get_type_hints(cls)
+    if cls is rec.ScanTaken:  # ROS's message has single precision
+        singles = {name: _singles for name, kind in hints.items() if kind is float}
+        return st.builds(cls, stamp_ns=_stamps, ranges=_strategy("", rec.Numbers), **singles)
     return st.builds(cls, **{name: _strategy(name, kind) for name, kind in hints.items()})
 
 

@@ -43,11 +43,12 @@ def test_rows_are_converted_to_the_conventions_of_ros():
 
 EXAMPLES = {
     "int": -(2**40),
-    "float": 0.1,
+    "float": 0.125,  # also in single precision
     "bool": True,
     "string": "é",
     "vector": (0.1, -2.0, 3.0),
     "quaternion": (1.0, 0.0, 0.0, 0.0),
+    "floats": [0.5, math.inf],
 }
 
 

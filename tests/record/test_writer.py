@@ -13,11 +13,15 @@ from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import CHUNK_NS, McapWriter
-from cloudrc.records import GuardChange
+from cloudrc.records import GuardChange, Perceived, ScanTaken
 from tests.record.conftest import MS, SECOND, cloud_records, world_records, write
 from tests.support.programs import loaded
 
-RECORDS = [*world_records(150), *cloud_records(150, 1500 * MS)]
+SEEN = (
+    ScanTaken(3001 * MS, 1, 2, -0.5, 0.5, 0.125, 10.0, [1.0, 2.0, 0.5]),
+    Perceived(3002 * MS, 3001 * MS, 0, 0, 0, 1, 2, (1.0, 2.0, 3.0)),
+)
+RECORDS = [*world_records(150), *cloud_records(150, 1500 * MS), *SEEN]
 
 
 def test_other_programs_can_read_every_topic(tmp_path):

@@ -128,7 +128,7 @@ def test_a_living_world_that_counts_as_dead_gets_a_new_nonce(cloud):
     assert cloud.hello().nonce == nonce
 
 
-@pytest.mark.parametrize(("code", "text"), [("version", "v5, we speak v7: "), ("key", KEY_TEXT)])
+@pytest.mark.parametrize(("code", "text"), [("version", "v5, we speak v8: "), ("key", KEY_TEXT)])
 def test_another_version_or_key_is_logged_once(code, text):
     bare = Bare(ring())
     old = bytes([5]) + bare.cloud("a").hello()[1:]

@@ -8,12 +8,14 @@ from hypothesis import strategies as st
 
 from cloudrc.link.verify.probe import PROBE
 from cloudrc.messages import (
+    RAYS_MAX,
     SENSORS_MAX,
     Cause,
     Command,
     GuardState,
     Odometry,
     OperatorRequest,
+    RangeScan,
     Request,
     Start,
     Telemetry,
@@ -45,12 +47,15 @@ requests = st.builds(
     *(st.integers(-1, 2**63 - 1), st.just(0)),  # the epoch is in the header
     st.text(max_size=16),
 )
+distances = st.lists(unsigned[16], max_size=RAYS_MAX).map(tuple)
+scans = st.builds(RangeScan, stamps, distances)
 
 
 COME_BACK = {
     "telemetry": telemetries,
     "command": commands,
     "operator": requests,
+    "scan": scans,
 }
 
 
@@ -87,6 +92,7 @@ def test_every_wrong_length_direction_and_version_is_refused(kind):
         Kind.COMMAND: {len(whole) + 8 + 12 * n for n in range(1, 81)},
         Kind.OPERATOR: {len(whole) + n for n in range(1, 65)},
         Kind.TELEMETRY: {len(whole) + 8 * n for n in range(1, 17)},
+        Kind.SCAN: {len(whole) + 2 * n for n in range(1, 542)},
     }.get(kind, set())
     assert max(longer, default=0) <= codec.DATAGRAM_MAX <= 1200
     for length in {*range(1300), 2048} - longer - {len(whole)}:
@@ -102,7 +108,7 @@ def test_every_wrong_length_direction_and_version_is_refused(kind):
 
 def test_an_unknown_kind_is_refused_at_every_length():
     """For example, a probe of `link verify` has the header of a tunnel's datagram."""
-    for kind in (0, 9, PROBE):
+    for kind in (0, 10, PROBE):
         for size in sorted({codec.HEADER_SIZE, *codec.SIZES.values(), codec.DATAGRAM_MAX}):
             data = codec.encode_header(kind, 1, 1, 2).ljust(size, b"\0")
             assert outcome(codec.check, data) == "malformed"

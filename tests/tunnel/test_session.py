@@ -4,7 +4,7 @@
 
 import pytest
 
-from cloudrc.messages import ZERO, Command
+from cloudrc.messages import ZERO, Command, RangeScan
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
@@ -163,3 +163,15 @@ def test_a_passed_message_has_the_counter_of_its_datagram():
     world.begin(2)
     assert refuses(world, passed, "old_epoch")
     assert refuses(Session(Direction.UPLINK, world.ring), passed, "old_epoch")
+
+
+@pytest.mark.parametrize(
+    ("kind", "message", "encode"),
+    [
+        (Kind.COMMAND, Command(1, 2, 3, ZERO, 0.0, (ZERO, ZERO)), codec.encode_command),
+        (Kind.SCAN, RangeScan(1, (0, 300, 20)), codec.encode_scan),
+    ],
+)
+def test_a_passed_message_is_as_long_as_its_datagram(kind, message, encode):
+    _, end = pair()
+    assert end.pass_on(kind, message).size == len(end.seal(kind, encode(message)))

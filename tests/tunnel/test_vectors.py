@@ -8,7 +8,7 @@ import struct
 
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from cloudrc.messages import Command
+from cloudrc.messages import Command, RangeScan
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Direction, Kind
 from cloudrc.tunnel.handshake import ClientHandshake, ServerHandshake
@@ -27,13 +27,13 @@ def derived(salt, info):
 
 GOLDEN = {
     "accept": (
-        "07000700000000020000000000000000636c6f75642020202020202020202020776f726c642020202020"
-        "202020202020636c6f636b2020202020202020202020006dd44578972cf95d28cd35d4a05280ee"
+        "08000700000000020000000000000000636c6f75642020202020202020202020776f726c642020202020"
+        "202020202020636c6f636b202020202020202020202000fd1475d23fc8628223530f1ba86724da"
     ),
     "command": (
-        "070107000000000601000000000000001ca1c4fd79f9a3ace043c427d057383ef63acdfee43e695569ef"
-        "63d759ffbbc288c3efabaa084b2e8b0514ec06f58131e5b7792b23d7e389189571a1d14fe6a130fa1a90"
-        "8bc2568b"
+        "08010700000000060100000000000000ec2ab33bfdac561646213f3a4a70240460d0a3f2c6de0ab698e7"
+        "503d6d169816a85ac1663bcad6bcf60e132101233551653ade585bf42fb7e14cb33e87893cce13f4603d"
+        "f2d9d8f9"
     ),
 }
 """Bytes of datagrams. If they change, the format has changed: raise `codec.VERSION`."""
@@ -41,14 +41,14 @@ GOLDEN = {
 
 def greeting(direction, epoch, kind, counter, body):
     """Make a greeting as docs/wire.md describes it."""
-    data = struct.pack("<BBIBBQ", 7, direction, epoch, 0, kind, counter) + body
-    return data + hmac.digest(derived(b"", b"cloudrc 7 greeting"), data, hashlib.sha256)[:16]
+    data = struct.pack("<BBIBBQ", 8, direction, epoch, 0, kind, counter) + body
+    return data + hmac.digest(derived(b"", b"cloudrc 8 greeting"), data, hashlib.sha256)[:16]
 
 
 def sealed(direction, epoch, kind, counter, body):
     """Make a datagram of a session as docs/wire.md describes it."""
-    key = derived(CLOUD + WORLD, b"cloudrc 7 session %d %d" % (direction, epoch))
-    header = struct.pack("<BBIBBQ", 7, direction, epoch, 0, kind, counter)
+    key = derived(CLOUD + WORLD, b"cloudrc 8 session %d %d" % (direction, epoch))
+    header = struct.pack("<BBIBBQ", 8, direction, epoch, 0, kind, counter)
     return header + AESGCM(key).encrypt(header[4:], body, header)
 
 
@@ -64,7 +64,7 @@ def test_the_tunnel_is_as_described_and_as_it_was():
         )
         return told.datagrams[0]
 
-    cookie = hmac.digest(derived(WORLD, b"cloudrc 7 cookies"), b"3", hashlib.sha256)[:13]
+    cookie = hmac.digest(derived(WORLD, b"cloudrc 8 cookies"), b"3", hashlib.sha256)[:13]
     first = cloud.greet(Kind.HELLO, client.make_hello())
     challenge = answer(first)
     assert codec.decode(Kind.CHALLENGE, cloud.open(challenge)[-1])[0] == cookie
@@ -90,16 +90,23 @@ def test_the_tunnel_is_as_described_and_as_it_was():
     plan = Command(1, 2, 3, (4.0, 5.0, 6.0), 7.0, ((1.0, 2.0, 3.0), (4.0, 5.0, 6.5)), 8)
     more = struct.pack("<q6f", 8, 1.0, 2.0, 3.0, 4.0, 5.0, 6.5)
     assert codec.encode_command(plan) == body + more
+    scan = codec.encode_scan(RangeScan(1, (0, 2, 65535)))
+    assert scan == struct.pack("<qHHH", 1, 0, 2, 65535)
     cloud.seal(Kind.COMMAND, body)
     command, alive = cloud.seal(Kind.COMMAND, body), world.seal(Kind.ALIVE, b"")
     assert [command, alive] == [sealed(1, 7, 6, 1, body), sealed(0, 7, 8, 0, b"")]
     assert {"accept": accept.hex(), "command": command.hex()} == GOLDEN
     assert world.open(command) == (6, 7, 1, body)
     assert cloud.open(alive) == (8, 7, 0, b"")
+    sent = world.seal(Kind.SCAN, scan)
+    assert sent == sealed(0, 7, 9, 0, scan)
+    assert cloud.open(sent) == (9, 7, 0, scan)
+    assert codec.decode_scan(scan) == RangeScan(1, (0, 2, 65535))
+    assert len(world.seal(Kind.SCAN, codec.encode_scan(RangeScan(1, (0,) * 181)))) == 402
 
 
 def test_names_and_nonces_are_derived_as_described():
-    assert Key(SECRET).name == derived(b"", b"cloudrc 7 name")[:4].hex()
+    assert Key(SECRET).name == derived(b"", b"cloudrc 8 name")[:4].hex()
     client = ClientHandshake(CLOUD, CLOCK)
     for world in (b"1" * 16, b"2" * 16, b"1" * 16):  # the first one comes back
         client.receive_accept(1, codec.Accept(CLOUD, world, CLOCK), asks=True)
