@@ -125,8 +125,8 @@ def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any
     bodies = read_shapes(world)
     markers = encode_markers(0, scene_shapes(bodies, scene_of(world).tubes, frames.prefix))
     description = urdf(world.robot, frames, bodies.robot)
-    exactness = covariances(world.sensors)
-    shown = Shown(frames, markers, description, exactness, not options.no_navigation)
+    exactness, navigates = covariances(world.sensors), not options.no_navigation
+    shown = Shown(frames, markers, description, exactness, navigates, bodies.scanner)
 
     def tell(text: str) -> None:
         print_line(f"ros: {text}")

@@ -18,10 +18,13 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from cloudrc.messages import Quaternion, Vector
 from cloudrc.outside.values import InvalidValueError
 
 Array: TypeAlias = NDArray[np.float64]
 Rgba: TypeAlias = tuple[float, float, float, float]
+Pose: TypeAlias = tuple[Vector, Quaternion]
+"""Position [m] and orientation wxyz [1]."""
 
 SHAPES_FILE = "shapes.npz"
 """Name of the attachment of a recording."""
@@ -62,6 +65,7 @@ class Shapes:
     robot: tuple[Surface, ...] = ()  # at rest, in the frame of its base
     scene: tuple[Surface, ...] = ()  # without infinite planes
     planar: bool = False  # whether the robot stays on the ground
+    scanner: Pose | None = None  # of the robot's scanner, in the frame of the base
 
     @staticmethod
     def of(surfaces: Sequence[Surface], planar: bool) -> Shapes:
@@ -80,9 +84,12 @@ class Shapes:
     def to_bytes(self) -> bytes:
         """Return the content of a file, which `from_bytes` reads; equal shapes give equal bytes."""
         surfaces = [*self.robot, *self.scene]
-        file = BytesIO()
+        file, more = BytesIO(), dict[str, Any]()
+        if self.scanner is not None:  # robots without one keep their bytes
+            more["scanner"] = np.array([*self.scanner[0], *self.scanner[1]])
         np.savez_compressed(
             file,
+            **more,
             planar=np.array(self.planar),
             bodies=np.array([surface.body for surface in surfaces], dtype=np.str_),
             rgba=np.array([surface.rgba for surface in surfaces], np.float32).reshape(-1, 4),
@@ -119,7 +126,12 @@ def _read(file: dict[str, NDArray[Any]]) -> Shapes:
             file["bodies"], points, triangles, colours, file["convex"], strict=False
         )
     ]
-    return Shapes.of(found, bool(file["planar"]))
+    shapes = Shapes.of(found, bool(file["planar"]))
+    if "scanner" not in file:
+        return shapes
+    x, y, z, *turn = file["scanner"].astype(float).tolist()
+    a, b, c, d = turn
+    return replace(shapes, scanner=((x, y, z), (a, b, c, d)))
 
 
 def _fan(polygons: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -40,7 +40,8 @@ def main(folder: Path, port: int) -> None:
         stack.enter_context(until_interrupted())
         socket = Path(under_way()[folder].removeprefix("unix:"))
         world = read_experiment(str(folder / "config.yaml")).world
-        views = LiveViews(scene_shapes(read_shapes(world), scene_of(world).tubes))
+        shapes = read_shapes(world)
+        views = LiveViews(scene_shapes(shapes, scene_of(world).tubes), shapes.scanner)
         reader = RecordReader(socket.parent)
         stack.callback(reader.close)
         try:

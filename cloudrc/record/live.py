@@ -93,8 +93,14 @@ def frames_of(control: Control, prefix: str = "") -> dict[str, Pose]:
 
 def encode_transforms(stamp_ns: int, poses: Mapping[str, Pose], parent: str = WORLD) -> bytes:
     """Encode a tf2_msgs/TFMessage as CDR: frame -> its pose in `parent` at `stamp_ns` [ns]."""
+    return encode_tree(stamp_ns, {parent: poses})
+
+
+def encode_tree(stamp_ns: int, tree: Mapping[str, Mapping[str, Pose]]) -> bytes:
+    """Encode a tf2_msgs/TFMessage likewise: parent -> frame -> its pose in the parent."""
     transforms = [
         (header(stamp_ns, parent), frame, (position, (x, y, z, w)))
+        for parent, poses in tree.items()
         for frame, (position, (w, x, y, z)) in poses.items()
     ]
     return pack("tf2_msgs/msg/TFMessage", transforms)

@@ -6,12 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from cloudrc.geometry.shapes import Pose
 from cloudrc.messages import GuardState
 from cloudrc.record.content import Message
 from cloudrc.record.live import BASE, encode_transforms, frames_of
-from cloudrc.record.ros import encode
+from cloudrc.record.ros import LIDAR, encode
 from cloudrc.record.topics import TOPICS, topics_of
-from cloudrc.records import Control, GuardChange, Record, TelemetrySent
+from cloudrc.records import Control, GuardChange, Record, ScanTaken, TelemetrySent
 from cloudrc.report.markers import MarkerShape, encode_markers
 
 REPEAT_NS = 1_000_000_000
@@ -24,9 +25,9 @@ class LiveViews:
     Of the robot, cloud knows what telemetry says: the frame `base_link` is its measured pose.
     """
 
-    def __init__(self, shapes: Sequence[MarkerShape]) -> None:
-        """Set the bodies of /scene."""
-        self._shapes = shapes
+    def __init__(self, shapes: Sequence[MarkerShape], scanner: Pose | None = None) -> None:
+        """Set the bodies of /scene, and the pose of the scanner in the frame of the base."""
+        self._shapes, self._scanner = shapes, scanner
         self._guard: GuardState | None = None
         self._repeated_ns = -REPEAT_NS
 
@@ -37,6 +38,9 @@ class LiveViews:
             yield topic.name, row[0], encode(topic, row)
         if isinstance(record, TelemetrySent):
             yield from self._of_telemetry(record)
+        elif isinstance(record, ScanTaken) and self._scanner is not None:
+            stamp_ns = record.stamp_ns
+            yield "/tf", stamp_ns, encode_transforms(stamp_ns, {LIDAR: self._scanner}, BASE)
         elif isinstance(record, Control):
             yield "/tf", record.stamp_ns, encode_transforms(record.stamp_ns, frames_of(record))
 

@@ -49,12 +49,14 @@ def render(
     pictures: Sequence[Picture],
     environment: Mapping[str, Any],
     replay: str = "",
+    polar: str = "",
     still: Picture | None = None,
 ) -> str:
     """Return the HTML of the page.
 
     `environment` is the content of environment.json, `replay` the HTML of the 3-D replay or of a
-    line that says why there is none. Readers see `still` where the browser draws no 3-D.
+    line that says why there is none, `polar` that of the scans, "" without any. Readers see `still`
+    where the browser draws no 3-D.
     """
     run, experiment, verdict = assessment.run, assessment.experiment, assessment.verdict
     headline, accent = HEADLINES[verdict.outcome]
@@ -74,6 +76,7 @@ def render(
         notes=_list([escape(note) for note in assessment.notes], "note"),
         facts=_facts(run, experiment, assessment.flight),
         replay=replay,
+        polar=polar,
         still=_still(still) if still else "",
         figures="\n".join(_figure(n, picture) for n, picture in enumerate(pictures, start=1)),
         numbers=_table_rows(assessment.numbers),

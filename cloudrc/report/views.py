@@ -3,8 +3,9 @@
 """Make topics for viewers: Foxglove and Lichtblick show them without settings.
 
 Each moving thing is a frame on `/tf`: `base_link` is the robot's true pose, `estimate` the pose
-that cloud predicted, `setpoint` the position that the controller tracks. `/scene` has one message:
-a marker for each body. A marker moves with its frame; the scene has the frame `world`.
+that cloud predicted, `setpoint` the position that the controller tracks, `lidar` the scanner, where
+`/scan` was measured. `/scene` has one message: a marker for each body. A marker moves with its
+frame; the scene has the frame `world`.
 
 `estimate` and `setpoint` have the stamps of `/estimated_odometry`. Each stamp is the time at which
 cloud sent a command.
@@ -21,8 +22,8 @@ from cloudrc.metrics.control import prediction_errors, tracking_errors
 from cloudrc.metrics.flight import Array, Columns, select
 from cloudrc.record.columns import Recording
 from cloudrc.record.content import Message
-from cloudrc.record.live import encode_transforms
-from cloudrc.record.ros import pack
+from cloudrc.record.live import BASE, encode_transforms
+from cloudrc.record.ros import LIDAR, pack
 from cloudrc.record.topics import VIEWS
 from cloudrc.report.flown import flight_of, flown_shapes
 from cloudrc.report.markers import encode_markers, path_shape, scene_shapes
@@ -40,9 +41,14 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]
         return []
     poses, control = _thin(truth.columns), _thin(flight.control)
     first_ns = int(truth["stamp_ns"][0])
-    shapes = scene_shapes(flown_shapes(recording, experiment), flight.scene.tubes)
+    bodies, shown = flown_shapes(recording, experiment), list[Message]()
+    shapes = scene_shapes(bodies, flight.scene.tubes)
     if len(path := poses["position"]) > 1:
         shapes.append(path_shape("path", path))
+    if (scanner := bodies.scanner) is not None:
+        for stamp_ns in recording["/scan"]["stamp_ns"].tolist():
+            lidar = encode_transforms(stamp_ns, {LIDAR: scanner}, BASE)
+            shown.append(("/tf", stamp_ns, lidar))
     stamps_ns = flight.control["stamp_ns"]
     tracking = tracking_errors(flight, flight.true_position(stamps_ns))
     return [
@@ -51,6 +57,7 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]
         *_transforms(control, estimate=("position", "orientation_wxyz"), setpoint=("setpoint", "")),
         *_errors("/tracking_error", stamps_ns, tracking),
         *_errors("/prediction_error", *prediction_errors(flight)[1:]),
+        *shown,
     ]
 
 

@@ -176,6 +176,7 @@ def _draw(
     from cloudrc.report.figures import PAGE_KINDS, PRINT_KINDS, draw_all, draw_still
     from cloudrc.report.figures.style import Look, Subject
     from cloudrc.report.page import render
+    from cloudrc.report.polar import write_polar
 
     flown = assessment.experiment
     shapes = flown_shapes(assessment.flight.recording, flown)
@@ -191,7 +192,8 @@ def _draw(
                 write_atomically(target / f"{picture.name}.{kind}", content)
     if page:
         still = draw_still(subject) if len(assessment.flight.truth["position"]) else None
-        text = render(assessment, pictures, environment, _replay(assessment), still)
+        moving = _replay(assessment), write_polar(assessment.flight)
+        text = render(assessment, pictures, environment, *moving, still)
         write_atomically(folder / "report.html", text.encode("utf-8"))
 
 

@@ -20,7 +20,9 @@ def read_shapes(world: World) -> Shapes:
     """Compile the robot and its scene, and return their shapes."""
     robot = known_robot(world.robot)
     with naming(f"robot {world.robot}"):
-        return shapes_of(compile_model(robot.model, file_of(world.scene)), planar=robot.planar)
+        model = compile_model(robot.model, file_of(world.scene))
+        site = None if robot.scan is None else robot.scan.site
+        return shapes_of(model, planar=robot.planar, scan_site=site)
 
 
 def flown_files(world: World) -> dict[str, bytes]:

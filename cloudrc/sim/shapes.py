@@ -13,8 +13,8 @@ import numpy as np
 from cloudrc.geometry import shapes
 from cloudrc.geometry.scene import FLOOR
 from cloudrc.geometry.shapes import Rgba, Shapes, Surface
-from cloudrc.sim.engine import GEOM, at_rest
-from cloudrc.sim.scene import bodies_of_geoms
+from cloudrc.sim.engine import GEOM, at_rest, mujoco
+from cloudrc.sim.scene import bodies_of_geoms, find_part
 
 SHOWN = 3
 """Number of the first group of geoms that MuJoCo's viewers do not show: usually, geoms of groups
@@ -25,11 +25,12 @@ WIDE = 20.0
 """Half the edge of a plane without a size [m]."""
 
 
-def shapes_of(model: Any, *, planar: bool) -> Shapes:
+def shapes_of(model: Any, *, planar: bool, scan_site: str | None = None) -> Shapes:
     """Return the shapes of a compiled `MjModel` of a robot in a scene.
 
     Joints are at rest. Planes of the body `floor` are left out, because viewers draw the floor as a
-    grid. `planar` tells whether the robot stays on the ground.
+    grid. `planar` tells whether the robot stays on the ground, `scan_site` names the site of its
+    scanner.
     """
     data, base = at_rest(model), model.jnt_bodyid[0]
     places, turns = data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3)
@@ -45,7 +46,15 @@ def shapes_of(model: Any, *, planar: bool) -> Shapes:
         surface = replace(surface, body=body, rgba=_rgba(model, geom))
         surface = surface.placed(places[geom], turns[geom])
         found.append(surface if body else surface.placed(-position @ axes, axes.T))
-    return Shapes.of(found, planar)
+    shapes = Shapes.of(found, planar)
+    if scan_site is None:
+        return shapes
+    site = find_part(model, "site", scan_site, "scan.site")
+    turn = np.empty(4)
+    mujoco.mju_mat2Quat(turn, (axes.T @ data.site_xmat[site].reshape(3, 3)).ravel())
+    x, y, z = ((data.site_xpos[site] - position) @ axes).tolist()
+    a, b, c, d = turn.tolist()
+    return replace(shapes, scanner=((x, y, z), (a, b, c, d)))
 
 
 def _shown(model: Any, bodies: list[str]) -> list[int]:

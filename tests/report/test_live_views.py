@@ -4,8 +4,9 @@
 
 from rosbags.typesys import Stores, get_typestore
 
-from cloudrc.messages import GuardState
+from cloudrc.messages import UPRIGHT, GuardState
 from cloudrc.record.topics import VIEWS
+from cloudrc.records import ScanTaken
 from cloudrc.report.live_views import REPEAT_NS, LiveViews
 from tests.support.told import told
 
@@ -32,3 +33,16 @@ def test_the_guard_comes_at_a_change_and_with_the_scene_once_a_second():
     changed = topics(views, told(20, GuardState.TRACK))
     assert ("/guard" in changed, "/scene" in changed) == (True, False)
     assert {"/guard", "/scene"} <= set(topics(views, told(REPEAT_NS, GuardState.TRACK)))
+
+
+def test_a_scan_comes_with_the_frame_of_its_scanner():
+    scan = ScanTaken(5, 1, 0, -0.5, 0.25, 0.125, 10.0, [1.0, 2.0])
+    views = LiveViews([], ((0.1, 0.0, 0.2), UPRIGHT))
+    found = {topic: data for topic, _, data in views.of(scan)}
+    shown = STORE.deserialize_cdr(found["/scan"], "sensor_msgs/msg/LaserScan")
+    assert (shown.header.frame_id, shown.ranges.tolist()) == ("lidar", [1.0, 2.0])
+    assert (shown.angle_min, shown.angle_max, shown.angle_increment) == (-0.5, -0.25, 0.25)
+    (frame,) = STORE.deserialize_cdr(found["/tf"], VIEWS["/tf"]).transforms
+    assert (frame.header.frame_id, frame.child_frame_id) == ("base_link", "lidar")
+    assert frame.transform.translation.x == 0.1
+    assert topics(LiveViews([]), scan) == ["/scan"]

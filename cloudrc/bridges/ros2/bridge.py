@@ -23,6 +23,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.type_support import check_for_type_support
+from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -34,17 +35,22 @@ from cloudrc.bridges.ros2.own_node import NEWEST, QUEUED, OwnNode
 from cloudrc.bridges.ros2.requests import RosRequests
 from cloudrc.console.steering import VERBS, Steering
 from cloudrc.drivers.readers import RecordReader
+from cloudrc.geometry.shapes import Pose
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Quaternion, Telemetry, Vector
 from cloudrc.record.live import (
     EXACT,
+    WORLD,
     encode_diagnostics,
     encode_odometry,
     encode_status,
     encode_text,
     encode_transforms,
+    encode_tree,
     frames_of,
 )
-from cloudrc.records import Control, Record, TelemetrySent
+from cloudrc.record.ros import pack_scan
+from cloudrc.record.topics import TOPICS
+from cloudrc.records import Control, Record, ScanTaken, TelemetrySent
 from cloudrc.report.markers import GOAL, encode_markers, path_shape
 
 KEPT = QoSProfile(
@@ -70,7 +76,8 @@ JUMP = 0.5
 
 def load_messages() -> None:
     """Load the code of all messages; raise an exception if it is not for this ROS or Python."""
-    for kind in (Odometry, PoseStamped, Twist, String, Trigger, MarkerArray, DiagnosticArray):
+    own = (Odometry, LaserScan, PoseStamped, Twist, String, Trigger, MarkerArray, DiagnosticArray)
+    for kind in own:
         check_for_type_support(kind)
 
 
@@ -82,6 +89,7 @@ class Shown(NamedTuple):
     description: str  # URDF
     covariances: Covariances = (EXACT, EXACT)  # of the measured pose and twist
     navigates: bool = True  # whether it serves Nav2's action
+    scanner: Pose | None = None  # of the robot's scanner in the frame of its base; None: none
 
 
 class RosBridge(OwnNode):
@@ -98,16 +106,17 @@ class RosBridge(OwnNode):
         """Open the node below `namespace`; `tell` gets words for the user."""
         super().__init__("cloudrc_bridge", namespace)
         self._robot = namespace.strip("/")
-        self._frames, self._markers = shown.frames, shown.scene
+        self._frames, self._markers, self._scanner = shown.frames, shown.scene, shown.scanner
         self._covariances = shown.covariances
         self._steering, self._requests = steering, requests
         self._health, self._news = FlightHealth(), MissionNews(steering.api, requests)
         self._guard: GuardState | None = None
         self._trail: deque[Vector] = deque(maxlen=TRAIL_MAX)
         self._watchers = 0  # subscriptions to the scene
-        self._offset_ns = _wall_offset_ns()
+        self._offset_ns, self._slip_ns = _wall_offset_ns(), 0
         publisher = self.node.create_publisher
         self._odometry = publisher(Odometry, "odom", QUEUED)
+        self._scans = publisher(LaserScan, "scan", QUEUED) if shown.scanner else None
         self._guards = publisher(String, "cloudrc/guard", KEPT)
         self._scene = publisher(MarkerArray, "cloudrc/scene", KEPT)
         self._path = publisher(MarkerArray, "cloudrc/path", KEPT)
@@ -162,16 +171,22 @@ class RosBridge(OwnNode):
         from tf2_msgs.msg import TFMessage
 
         self._static = self.node.create_publisher(TFMessage, "/tf_static", KEPT)
-        tree = encode_transforms(time.time_ns(), {MAP: HERE})
+        tree: dict[str, dict[str, Any]] = {WORLD: {MAP: HERE}}
         if self._frames.rep_105:
-            tree = encode_transforms(time.time_ns(), {self._frames.odom: HERE}, MAP)
-        self._static.publish(tree)
+            tree = {MAP: {self._frames.odom: HERE}}
+        if self._scanner is not None:
+            tree[self._frames.base] = {self._frames.lidar: self._scanner}
+        self._static.publish(encode_tree(time.time_ns(), tree))  # a late node gets one message
         return self.node.create_publisher(TFMessage, "/tf", QUEUED)
 
     def _publish(self, record: Record) -> None:
         self._health.take(record)
         if isinstance(record, TelemetrySent):
             self._publish_telemetry(record.telemetry)
+        elif isinstance(record, ScanTaken) and self._scans is not None:
+            stamp_ns, *values = TOPICS["/scan"].row(record)
+            stamp_ns += self._slip_ns + self._offset_ns
+            self._scans.publish(pack_scan((stamp_ns, *values), self._frames.lidar))
         elif isinstance(record, Control) and self._transforms is not None:
             stamp_ns = record.stamp_ns + self._offset_ns
             frames = frames_of(record, self._frames.prefix)
@@ -179,6 +194,7 @@ class RosBridge(OwnNode):
 
     def _publish_telemetry(self, telemetry: Telemetry) -> None:
         stamp_ns, position, orientation, velocity, rates = telemetry.odometry
+        self._slip_ns = telemetry.slip_ns
         stamp_ns += telemetry.slip_ns + self._offset_ns
         base, odom = self._frames.base, self._frames.odom
         pose = position, orientation

@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 from cloudrc.config.disturbances import SensorsConfig
 from cloudrc.geometry.shapes import Surface
 from cloudrc.record.live import BASE, WORLD, Covariance, covariance
+from cloudrc.record.ros import LIDAR
 
 MAP, ODOM = "map", "odom"
 """Frames of REP-105."""
@@ -31,6 +32,11 @@ class RobotFrames(NamedTuple):
     def base(self) -> str:
         """Frame of the robot's base."""
         return self.prefix + BASE
+
+    @property
+    def lidar(self) -> str:
+        """Frame of the robot's scanner."""
+        return self.prefix + LIDAR
 
     @property
     def odom(self) -> str:
