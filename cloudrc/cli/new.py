@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""`cloudrc new`: write the files of a robot of one's own."""
+"""`cloudrc new`: write the files of a robot or of a perception of one's own."""
 
 from __future__ import annotations
 
@@ -8,31 +8,60 @@ from pathlib import Path
 from shlex import quote
 
 from cloudrc.cli.parser import Options, Parser, add_verbs
+from cloudrc.errors import BadInputError
 
-VERBS = {"robot": "write a folder with a robot that flies, to change"}
+VERBS = {
+    "robot": "write a folder with a robot that flies, to change",
+    "perception": "write a file with a perception that drives by scans, to change",
+}
 EPILOG = """\
 examples:
   cloudrc new robot ./my_robot       robot.yaml, robot.xml and a test
-  cloudrc robot check ./my_robot"""
+  cloudrc robot check ./my_robot
+  cloudrc new perception ./my_perception.py"""
 
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    (robot,) = add_verbs(parser, VERBS).values()
+    robot, perception = add_verbs(parser, VERBS).values()
     robot.add_argument("folder", type=Path, metavar="DIR", help="folder for the files")
+    perception.add_argument("file", type=Path, metavar="FILE", help="Python file, NAME.py")
 
 
 def execute(options: Options) -> None:
     """Write the files, and print what to type next."""
+    if options.verb == "perception":
+        _write_perception(options.file)
+        return
     from cloudrc.runs.new_robot import write_robot
 
     folder = options.folder
     names = write_robot(folder)
-    path = folder if folder.is_absolute() or folder.parts[:1] == ("..",) else f"./{folder}"
-    typed = quote(str(path))
+    typed = _typed(folder)
     print(
         f"change {', '.join(names)} in {folder}, then:\n"
         f"  cloudrc robot check {typed}\n"
         f"  cloudrc run steps --mode virtual --set world.robot={typed}\n"
         f"  pytest {typed}"
     )
+
+
+def _write_perception(file: Path) -> None:
+    from cloudrc.runs.new_perception import write_perception
+
+    if file.suffix != ".py":
+        raise BadInputError(f"{file}: name a Python file, such as {file}.py")
+    if file.exists():
+        raise BadInputError(f"{file}: exists already; name another file")
+    write_perception(file)
+    typed = _typed(file)
+    print(
+        f"change see() in {file}, then:\n"
+        f"  cloudrc run gap --mode virtual --set cloud.perception={typed}\n"
+        f"  cloudrc run gap --mode virtual --set cloud.perception={typed} --set link.profile=lte"
+    )
+
+
+def _typed(path: Path) -> str:
+    """Return a path as it is typed where a name without a folder means a shipped file."""
+    return quote(str(path if path.is_absolute() or path.parts[:1] == ("..",) else f"./{path}"))
