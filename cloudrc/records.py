@@ -287,6 +287,19 @@ class CellWait(NamedTuple):
     wait_ns: Annotated[int, "ns", "from its departure until the cell had sent all of it"]
 
 
+class LinkWait(NamedTuple):
+    """Made by the driver, in virtual time: where a datagram waits in the link. Topic /link_wait."""
+
+    stamp_ns: int
+    uplink: Way
+    epoch: Epoch
+    counter: Number
+    queue_ns: Annotated[int, "ns", "wait at the bottleneck, with the time to send it there"]
+    request_ns: Annotated[int, "ns", "wait for the radio's request slot"]
+    grant_ns: Annotated[int, "ns", "from there to the end of its slot in the radio"]
+    repeat_ns: Annotated[int, "ns", "of the radio's repetitions"]
+
+
 class Perceived(NamedTuple):
     """Made by cloud: what became of a scan that the perception has looked at. Topic /perception.
 
@@ -408,7 +421,7 @@ class Lateness(NamedTuple):
 
 Record: TypeAlias = (
     (TelemetrySent | GroundTruth | ContactForce | SensorRead | Arrival | CommandApplied)
-    | (EnergyUsed | Left | CellWait)
+    | (EnergyUsed | Left | CellWait | LinkWait)
     | (GuardChange | Contact | SessionOpened | Control | PlanFollowed | MissionEvent)
     | (ScanTaken | Perceived)
     | (Fault | Counted | LinkChanged | LinkChecked | Lateness)

@@ -84,6 +84,9 @@ _STAMPS = {
     ("when the datagram has left the cell",
      "once per command and telemetry in a cell, in virtual time"):
         "/cell_wait",
+    ("departure of the datagram",
+     "once per command and telemetry, in virtual time, if the link has a rate or a radio"):
+        "/link_wait",
     ("instant of the event", "once per event"): "/mission",
     ("when world or cloud notices the fault", "once per fault; repetitions are counted"): "/fault",
     ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"): "/count",

@@ -14,13 +14,18 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
 
 from cloudrc.endpoint import Endpoint
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.queue import PacketQueue
 from cloudrc.messages import Datagram, Passed
-from cloudrc.records import Record
-from cloudrc.tunnel.codec import peek
+from cloudrc.records import LinkWait, Record
+from cloudrc.tunnel.codec import Kind, peek
+
+if TYPE_CHECKING:
+    from cloudrc.link.radio import RadioParts
 
 Sink = Callable[[list[Record], list[Record]], None]
 """Function that is called with the new records of world and the new records of cloud."""
@@ -86,6 +91,11 @@ class VirtualRun:
         self.cloud_clock = cloud_clock
         self.in_flight = PacketQueue() if in_flight is None else in_flight
         self.now_ns = 0
+        self._waits = list[Record]()
+        uplink.watch, downlink.watch = (
+            partial(self._note_wait, True),
+            partial(self._note_wait, False),
+        )
 
     def fly(self, until: Callable[[], bool], limit_ns: int, sink: Sink) -> None:
         """Run until `until()` is true or virtual time reaches `limit_ns` [ns].
@@ -101,7 +111,8 @@ class VirtualRun:
 
     def take_records(self) -> tuple[list[Record], list[Record]]:
         """Return the new records of world and of cloud."""
-        return self._world.take_records(), self._cloud.take_records()
+        waits, self._waits = self._waits, []
+        return self._world.take_records() + waits, self._cloud.take_records()
 
     @property
     def next_ns(self) -> int:
@@ -150,6 +161,20 @@ class VirtualRun:
                 if datagrams := cloud.take_datagrams():
                     self._send(datagrams, self._downlink)
         self.now_ns = end_ns
+
+    def _note_wait(
+        self,
+        uplink: bool,
+        packet: tuple[int, int, int],
+        now_ns: int,
+        queue_ns: int,
+        radio: RadioParts | None,
+    ) -> None:
+        """Record where telemetry or a command waits in the link."""
+        epoch, kind, counter = packet
+        if kind in (Kind.TELEMETRY, Kind.COMMAND):
+            waits_ns = queue_ns, *(radio or (0, 0, 0))
+            self._waits.append(LinkWait(now_ns, uplink, epoch, counter, *waits_ns))
 
     def _send(self, datagrams: list[Datagram], link: LinkDirection) -> None:
         for data in datagrams:

@@ -9,8 +9,8 @@ relay use the same model, so both get the same delays and losses.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, TypeAlias
 
 from cloudrc.link.draws import BLOCK, OVERTAKES, Fate, bit_flips, impairments, stream_key
 from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
@@ -18,6 +18,9 @@ from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
 if TYPE_CHECKING:
     from cloudrc.link.radio import RadioParts, Slots
 
+Watch: TypeAlias = "Callable[[tuple[int, int, int], int, int, RadioParts | None], None]"
+"""Is told of epoch, kind and counter of a packet, when it was sent [ns], its wait at the bottleneck
+[ns], and the parts of its delay in the radio, if there is one."""
 HEADER_BYTES = 28  # size of the IPv4 and UDP headers (RFC 791, RFC 768), also on the wire [bytes]
 _BYTE = b"\0"  # stands for the content of a packet
 _TABLES = 64  # number of blocks of impairments that are kept in memory
@@ -60,6 +63,7 @@ class LinkDirection:
     Attributes:
         corrupts: Whether the link may damage datagrams; if true, call `corrupted` for each.
         blackouts: Number of packets that were lost because they were sent in a blackout.
+        watch: Is called for each packet that waits at a bottleneck or in a radio, not for copies.
     """
 
     def __init__(
@@ -82,6 +86,7 @@ class LinkDirection:
         self._departures: deque[int] = deque()
         self._last_release_ns = 0
         self.blackouts = 0
+        self.watch: Watch | None = None
         self.replace_profile(profile)
 
     def replace_profile(
@@ -255,9 +260,13 @@ class LinkDirection:
                 departure = self._use_opportunity(size + HEADER_BYTES, now_ns)
             if departure is None:
                 return None
+            parts = self.radio_parts(*packet, departure, copy)
+            waited = departure > now_ns or parts is not None
+            if waited and copy == 0 and self.watch is not None:
+                self.watch(packet, now_ns, departure - now_ns, parts)
             arrival = departure
-            if self._radio is not None:
-                arrival += sum(self.radio_parts(*packet, departure, copy) or ())
+            if parts is not None:
+                arrival += sum(parts)
             delay_ns = conditions.delay_ns + entry
             if delay_ns > 0:
                 arrival += delay_ns

@@ -36,6 +36,10 @@ NO_CLOCK = (
 ONE_END = "the recording has one end of the loop: what happened at the other end is told together"
 
 
+LINK_PARTS = "queue_ns", "request_ns", "grant_ns", "repeat_ns"
+"""Where a datagram waits in the link, in its order: columns of /link_wait."""
+
+
 class Commands:
     """Commands of a flight, and the instants of each that its recording tells.
 
@@ -71,6 +75,30 @@ class Commands:
         waits_ns = _look_up(keys, datagrams(rows), rows["wait_ns"])
         is_known = (waits_ns != UNKNOWN_NS) & (sent_ns != UNKNOWN_NS)
         return np.where(is_known, sent_ns + np.where(is_known, waits_ns, 0), UNKNOWN_NS)
+
+    def behind_link(self, part: str, *, uplink: bool) -> Array:
+        """Return when the datagrams had a part of the link behind them [ns].
+
+        `part` is the last one that counts: a column of /link_wait. A part that no datagram has is
+        unknown, and so are all parts of a datagram whose copy arrived before it.
+        """
+        keys, arrivals = self.telemetry, "/uplink_delay"
+        sent_ns = self.at("/telemetry", keys)
+        if not uplink:
+            keys, arrivals, sent_ns = self.numbers, "/downlink_delay", self.left_ns
+        cell_ns = self.behind_cell(keys, sent_ns, uplink=uplink)
+        begin_ns = np.where(cell_ns == UNKNOWN_NS, sent_ns, cell_ns)
+        rows = self._flight.recording["/link_wait"].columns
+        rows = select(rows, rows["uplink"] == uplink)
+        if not rows[part].any():
+            return _untold(self)
+        parts_ns = np.cumsum([rows[name] for name in LINK_PARTS], axis=0)
+        through_ns, all_ns = (
+            _look_up(keys, datagrams(rows), parts_ns[row]) for row in (LINK_PARTS.index(part), -1)
+        )
+        is_known = (through_ns != UNKNOWN_NS) & (begin_ns != UNKNOWN_NS)
+        is_known &= begin_ns + np.where(is_known, all_ns, 0) <= self.at(arrivals, keys)
+        return np.where(is_known, begin_ns + np.where(is_known, through_ns, 0), UNKNOWN_NS)
 
     @property
     def left_ns(self) -> Array:
@@ -115,11 +143,21 @@ STAGES = (
     _stage("observation", lambda c: c.at("/telemetry", c.telemetry)),
     _stage("uplink_cell", lambda c: c.behind_cell(
         c.telemetry, c.at("/telemetry", c.telemetry), uplink=True), is_extra=True),
+    _stage("uplink_rate", lambda c: c.behind_link("queue_ns", uplink=True), is_extra=True),
+    _stage("uplink_request", lambda c: c.behind_link("request_ns", uplink=True), is_extra=True),
+    _stage("uplink_grant", lambda c: c.behind_link("grant_ns", uplink=True), is_extra=True),
+    _stage("uplink_repeat", lambda c: c.behind_link("repeat_ns", uplink=True), is_extra=True),
     _stage("uplink", lambda c: c.at("/uplink_delay", c.telemetry), at_cloud=True),
     _stage("queue", lambda c: c.at("/delay_estimate", c.numbers), at_cloud=True),
     _stage("compute", lambda c: c.at("/left", c.numbers), at_cloud=True, is_extra=True),
     _stage("downlink_cell", lambda c: c.behind_cell(
         c.numbers, c.left_ns, uplink=False), at_cloud=True, is_extra=True),
+    _stage("downlink_rate", lambda c: c.behind_link("queue_ns", uplink=False),
+           at_cloud=True, is_extra=True),
+    _stage("downlink_grant", lambda c: c.behind_link("grant_ns", uplink=False),
+           at_cloud=True, is_extra=True),
+    _stage("downlink_repeat", lambda c: c.behind_link("repeat_ns", uplink=False),
+           at_cloud=True, is_extra=True),
     _stage("downlink", lambda c: c.at("/downlink_delay", c.numbers)),
     _stage("wait", lambda c: c.at("/command_applied", c.numbers)),
 )  # fmt: skip
@@ -129,7 +167,7 @@ NUMBER = "budget_"
 """Begin of the names of the metrics; the name of a stage follows."""
 NEEDED = (
     *("/telemetry", "/uplink_delay", "/delay_estimate", "/downlink_delay", "/command_applied"),
-    *("/guard", "/mission", "/left", "/cell_wait"),
+    *("/guard", "/mission", "/left", "/cell_wait", "/link_wait"),
 )
 """Topics that the budget of a flight needs."""
 ENDS = {

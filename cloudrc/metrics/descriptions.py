@@ -34,10 +34,17 @@ RELAY_COUNTS = {
 AGE_STAGES = {
     "observation": "odometry waits for its datagram",
     "uplink_cell": "telemetry passes the cell",
+    "uplink_rate": "telemetry waits at the bottleneck",
+    "uplink_request": "telemetry waits for a request slot",
+    "uplink_grant": "grant and slot of the uplink",
+    "uplink_repeat": "repetitions of the uplink",
     "uplink": "uplink",
     "queue": "telemetry waits for cloud's period",
     "compute": "cloud computes",
     "downlink_cell": "command passes the cell",
+    "downlink_rate": "command waits at the bottleneck",
+    "downlink_grant": "slot of the downlink",
+    "downlink_repeat": "repetitions of the downlink",
     "downlink": "downlink",
     "wait": "command waits for the step",
 }

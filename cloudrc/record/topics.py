@@ -168,6 +168,9 @@ _TABLE = (
         "A command left cloud, cloud's clock. Only if a computation takes simulated time"),
     Topic("/cell_wait", "cloudrc_msgs/msg/CellWait", rec.CellWait, "world",
         "A datagram left the radio cell, world's clock. Only in virtual time, with a cell"),
+    Topic("/link_wait", "cloudrc_msgs/msg/LinkWait", rec.LinkWait, "world",
+        "Where a datagram waits in the link, world's clock. Only in virtual time, with a rate or a"
+        " radio"),
     Topic("/perception", "cloudrc_msgs/msg/Perceived", rec.Perceived, "cloud",
         "What became of a scan at cloud's perception, cloud's clock"),
     Topic("/mission", "cloudrc_msgs/msg/MissionEvent", rec.MissionEvent, "cloud",
@@ -192,7 +195,7 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 
 ADDED = ("/plan", "/sensor", "/scan", "/perception")
 """Topics that came later than the others; without rows they do not change a hash."""
-UNHASHED = ("/energy", "/left", "/cell_wait")
+UNHASHED = ("/energy", "/left", "/cell_wait", "/link_wait")
 """Topics that never change a hash: flights from before them keep theirs."""
 
 VIEWS: dict[str, str] = {

@@ -92,6 +92,7 @@ def world_records(count, start_ns=0):
             ]
     records += [rec.Contact(now, "board", ZERO, ZERO, ZERO, True)]
     records += [rec.Counted(now, "world", "sent", count), rec.CellWait(now, True, 1, 0, MS)]
+    records.append(rec.LinkWait(now, True, 1, 0, MS, 2 * MS, 3 * MS, 0))
     return sorted(records, key=attrgetter("stamp_ns"))
 
 

@@ -18,6 +18,8 @@ SETTINGS = {
     "in order of arrival": ("link.profile=paper-p3", "tunnel.order=arrival"),
     "blackouts": ("link.profile=handover",),
     "computes": ("link.profile=lte", "cloud.compute_ms=7"),
+    "waits at a bottleneck": ("link.profile=lte", "link.uplink.rate_kbit=300"),
+    "radio": ("link.profile=5g-sa", "link.uplink.rate_kbit=900"),
     "plans": ("link.profile=wifi", "cloud.plan_s=0.3", "cloud.predictor=model_based"),
 }
 

@@ -117,6 +117,17 @@ def test_other_commands_are_counted_by_where_they_ended(tmp_path):
     assert budget.document["ended"] == {"lost": 10, "superseded": 1, "guard": 20}
 
 
+def test_a_radio_is_cut_into_its_request_its_slot_and_its_repetitions(tmp_path):
+    """Telemetry comes 4 ms before a request slot; slot and grant take a pattern, then a slot."""
+    radio = "{slot_ms: .5, tdd: DDDSU, request_ms: 10, grant_ms: 2, error: 0, phase_ms: 8}"
+    settings = "link.profile=ideal", "link.uplink.delay_ms=3", f"link.uplink.radio={radio}"
+    stages = budget_of(flight_of(tmp_path, *settings)).document["stages"]
+    means = {name: each["mean"] * 1e3 for name, each in stages.items()}
+    expected = {"uplink_request": 4, "uplink_grant": 3, "uplink": 3}
+    assert {name: means[name] for name in expected} == pytest.approx(expected, abs=1e-9)
+    assert "uplink_repeat" not in means, "without errors, nothing is sent again"
+
+
 def test_a_simulated_computation_is_a_stage_of_its_own(tmp_path):
     stages = budget_of(flight_of(tmp_path, *SETTINGS["computes"])).document["stages"]
     assert stages["compute"]["mean"] == pytest.approx(0.007)
