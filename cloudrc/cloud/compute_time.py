@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from cloudrc.config.cloud import Cloud
 from cloudrc.config.compute import compute_times
-from cloudrc.config.schema import Cloud
 
 MS_TO_NS = 1_000_000
 

@@ -8,8 +8,8 @@ import logging
 from collections.abc import Mapping
 from pathlib import Path
 
+from cloudrc.config.cloud import Cloud
 from cloudrc.config.problems import problem_at
-from cloudrc.config.schema import Cloud
 from cloudrc.errors import BadInputError
 from cloudrc.outside.reuse import reuse
 from cloudrc.outside.tables import MILLISECONDS, CsvTable

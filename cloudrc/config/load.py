@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
+from cloudrc.config.cloud import Cloud
 from cloudrc.config.compute import compute_times
 from cloudrc.config.faults import NOT_IN_CLUSTER
 from cloudrc.config.ground import put_on_ground
@@ -47,12 +48,7 @@ from cloudrc.config.resolved import (
 )
 from cloudrc.config.robot import DEFAULT_LIMITS, known_robot
 from cloudrc.config.robot import facts as facts_of
-from cloudrc.config.schema import (
-    Cloud,
-    Experiment,
-    MissionConfig,
-    World,
-)
+from cloudrc.config.schema import Experiment, MissionConfig, World
 from cloudrc.errors import BadInputError
 from cloudrc.link.traces import read_trace
 from cloudrc.outside.document import Document, KeyPath, parse_value, read_document

@@ -29,9 +29,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from cloudrc import plugins
 from cloudrc.config import problems, shipped
+from cloudrc.config.choice import PlugIn
+from cloudrc.config.cloud import Cloud
 from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.robot import RobotFacts, known_robot, parameters
-from cloudrc.config.schema import Cloud, Experiment, PlugIn, Steps, World
+from cloudrc.config.schema import Experiment, Steps, World
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.outside import code

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
+from cloudrc.config.cloud import ComputeSpeed, Count, Sharing
 from cloudrc.config.profile import DirectionConfig
-from cloudrc.config.schema import ComputeSpeed, Count, Sharing
 from cloudrc.config.section import Section
 
 

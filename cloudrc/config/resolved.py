@@ -17,6 +17,8 @@ from pydantic import (
     model_validator,
 )
 
+from cloudrc.config.choice import PlugIn
+from cloudrc.config.cloud import Cloud
 from cloudrc.config.faults import OF_LINK, acting, refusal, with_faults
 from cloudrc.config.profile import DIRECTIONS, RANDOM, CloudTime, CommandAge, DirectionConfig
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, known_robot
@@ -24,12 +26,10 @@ from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import (
     SPEED_MPS,
     Acceleration,
-    Cloud,
     Experiment,
     GuardConfig,
     MissionConfig,
     PlanMax,
-    PlugIn,
     Speed,
     World,
 )

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from cloudrc.config import shipped
+from cloudrc.config.choice import PlugIn
 from cloudrc.config.heading import Heading
 from cloudrc.config.problems import validate
 from cloudrc.config.schema import (
@@ -24,7 +25,6 @@ from cloudrc.config.schema import (
     DeadTimes,
     NotNegatives,
     Parameters,
-    PlugIn,
     Positive,
     Speed,
     World,

@@ -50,7 +50,7 @@ class SharedCores:
     """
 
     def __init__(self, cores: int, sharing: Literal["fifo", "ps"]) -> None:
-        """Create idle cores; `config.schema.Cloud` describes the ways of sharing."""
+        """Create idle cores; `config.cloud.Cloud` describes the ways of sharing."""
         self.cores, self._is_fifo = cores, sharing == "fifo"
         self.inbox, self.clouds = list[Computation](), list[Computing]()
         self._free_ns = [0] * cores  # when each core is free [ns], a heap

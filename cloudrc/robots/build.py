@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc import plugins
+from cloudrc.config.choice import PlugIn
 from cloudrc.config.disturbances import Plant
 from cloudrc.config.overrides import BRAKING, build_plugin, onboard_values
 from cloudrc.config.problems import ProblemsError, at_key, problem_at
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, known_robot, parameters
 from cloudrc.config.scene import scene_of, steered_in
-from cloudrc.config.schema import PlugIn, World
+from cloudrc.config.schema import World
 from cloudrc.config.shipped import ROBOT_FILE, file_of
 from cloudrc.messages import ZERO, Vector
 from cloudrc.outside.document import KeyPath

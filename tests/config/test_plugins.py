@@ -8,9 +8,9 @@ from importlib.metadata import EntryPoint, EntryPoints
 import pytest
 
 from cloudrc import plugins
+from cloudrc.config.choice import PlugIn
 from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import build_plugin
-from cloudrc.config.schema import PlugIn
 from tests.config.conftest import refused_line
 
 SOURCE = '''"""Looks ahead by a share of the horizon.

@@ -8,9 +8,10 @@ import pytest
 
 import cloudrc
 from cloudrc.cloud.results import is_ours
+from cloudrc.config.choice import PlugIn
 from cloudrc.config.overrides import build_plugin, onboard_values
 from cloudrc.config.robot import facts, known_robot
-from cloudrc.config.schema import PlugIn, World
+from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
 from tests.conftest import nightly
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli.main import main
+from cloudrc.config.choice import PlugIn
 from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import dump
-from cloudrc.config.schema import PlugIn
 from cloudrc.drivers.machine import interpreter
 from cloudrc.processes import ends
 from cloudrc.runs.links.verify import find_experiment

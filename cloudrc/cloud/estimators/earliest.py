@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 
 from cloudrc.cloud.estimators import Estimator
-from cloudrc.config.schema import Count
+from cloudrc.config.cloud import Count
 
 
 class Earliest(Estimator):

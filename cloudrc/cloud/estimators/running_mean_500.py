@@ -10,7 +10,7 @@ an exponential average.
 from __future__ import annotations
 
 from cloudrc.cloud.estimators.running_mean import RunningMean
-from cloudrc.config.schema import Count
+from cloudrc.config.cloud import Count
 
 
 def build(count_max: Count = 500) -> RunningMean:

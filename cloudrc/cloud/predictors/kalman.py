@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from cloudrc.cloud.predictors import Model, Predictor
 from cloudrc.cloud.predictors._history import Replay
+from cloudrc.config.choice import PlugIn
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.robot import RobotFacts
-from cloudrc.config.schema import PlugIn, Positive
+from cloudrc.config.schema import Positive
 from cloudrc.messages import Command, Odometry
 
 Array = NDArray[np.float64]

@@ -19,9 +19,10 @@ from cloudrc import plugins
 from cloudrc.cloud.motion import Body
 from cloudrc.cloud.predictors import command_history
 from cloudrc.cloud.predictors._history import Replay
+from cloudrc.config.choice import PlugIn
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.robot import RobotFacts
-from cloudrc.config.schema import PlugIn, Positive
+from cloudrc.config.schema import Positive
 from cloudrc.messages import Odometry
 
 GAP_NS = 500_000_000
