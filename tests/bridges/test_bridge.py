@@ -311,6 +311,21 @@ def test_ros_reads_health_guard_and_frames():
     assert (moved.transform.translation.z, moved.transform.rotation.z) == (3.0, LEFT[3])
 
 
+@pytest.mark.parametrize(
+    ("frames", "parents"),
+    [
+        (RobotFrames(), {"map": "world", "lidar": "base_link"}),
+        (RobotFrames("a/", rep_105=True), {"a/odom": "map", "a/lidar": "a/base_link"}),
+    ],
+)
+def test_the_scanner_is_at_rest_in_the_base_and_the_world_in_the_map(frames, parents):
+    pose = (0.1, 0.0, 0.2), UPRIGHT
+    tree = frames.at_rest(pose)
+    assert {child: parent for parent in tree for child in tree[parent]} == parents
+    assert tree[frames.base][frames.lidar] == pose
+    assert frames.base not in frames.at_rest(None)
+
+
 def test_markers_move_with_the_robots_frames_and_the_scene_stays():
     corners, faces = np.eye(3), np.array([[0, 1, 2]], np.int32)
     bodies = Shapes((Surface("", corners, faces),), (Surface("box", corners, faces),))

@@ -28,7 +28,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from cloudrc.bridges.ros2.description import MAP, Covariances, RobotFrames
+from cloudrc.bridges.ros2.description import Covariances, RobotFrames
 from cloudrc.bridges.ros2.health import FlightHealth
 from cloudrc.bridges.ros2.mission import MissionNews, Navigation
 from cloudrc.bridges.ros2.own_node import NEWEST, QUEUED, OwnNode
@@ -36,10 +36,9 @@ from cloudrc.bridges.ros2.requests import RosRequests
 from cloudrc.console.steering import VERBS, Steering
 from cloudrc.drivers.readers import RecordReader
 from cloudrc.geometry.shapes import Pose
-from cloudrc.messages import UPRIGHT, ZERO, GuardState, Quaternion, Telemetry, Vector
+from cloudrc.messages import ZERO, GuardState, Quaternion, Telemetry, Vector
 from cloudrc.record.live import (
     EXACT,
-    WORLD,
     encode_diagnostics,
     encode_odometry,
     encode_status,
@@ -66,8 +65,6 @@ WAKE = 0.05
 """Longest wait for records [s]."""
 THREADS = 4
 """Number of threads that serve requests: an emergency stop does not wait for another request."""
-HERE = ZERO, UPRIGHT
-"""Pose of a frame in another one with the same origin and axes."""
 TRAIL_STEP, TRAIL_MAX = 0.05, 1000
 """Shortest distance between two points of the flown path [m], and their largest number."""
 JUMP = 0.5
@@ -171,11 +168,7 @@ class RosBridge(OwnNode):
         from tf2_msgs.msg import TFMessage
 
         self._static = self.node.create_publisher(TFMessage, "/tf_static", KEPT)
-        tree: dict[str, dict[str, Any]] = {WORLD: {MAP: HERE}}
-        if self._frames.rep_105:
-            tree = {MAP: {self._frames.odom: HERE}}
-        if self._scanner is not None:
-            tree[self._frames.base] = {self._frames.lidar: self._scanner}
+        tree = self._frames.at_rest(self._scanner)
         self._static.publish(encode_tree(time.time_ns(), tree))  # a late node gets one message
         return self.node.create_publisher(TFMessage, "/tf", QUEUED)
 

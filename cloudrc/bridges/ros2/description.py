@@ -10,12 +10,15 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 from cloudrc.config.disturbances import SensorsConfig
-from cloudrc.geometry.shapes import Surface
+from cloudrc.geometry.shapes import Pose, Surface
+from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.record.live import BASE, WORLD, Covariance, covariance
 from cloudrc.record.ros import LIDAR
 
 MAP, ODOM = "map", "odom"
 """Frames of REP-105."""
+HERE = ZERO, UPRIGHT
+"""Pose of a frame in another one with the same origin and axes."""
 Covariances = tuple[Covariance, Covariance]
 
 
@@ -47,6 +50,16 @@ class RobotFrames(NamedTuple):
     def ground(self) -> tuple[str, ...]:
         """Frames in which a goal may be."""
         return (MAP, WORLD, self.odom) if self.rep_105 else (MAP, WORLD)
+
+    def at_rest(self, scanner: Pose | None) -> dict[str, dict[str, Pose]]:
+        """Return frame -> frames that do not move in it -> their poses in it.
+
+        `scanner` is the pose of the robot's scanner in the frame of its base; None: it has none.
+        """
+        tree = {MAP: {self.odom: HERE}} if self.rep_105 else {WORLD: {MAP: HERE}}
+        if scanner is not None:
+            tree[self.base] = {self.lidar: scanner}
+        return tree
 
 
 def covariances(errors: SensorsConfig) -> Covariances:
