@@ -5,7 +5,10 @@
 import numpy as np
 import pytest
 
-from cloudrc.link.cell import Bulk, Cell, CellPacket, Video
+from cloudrc.link.cell import Bulk, Cell, CellPacket, CellQueue, Usage, Video
+from cloudrc.link.model import HEADER_BYTES, LinkDirection
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.queue import NOTHING_NS
 from cloudrc.link.waiting import md1, nddd1
 
 MS = 1_000_000
@@ -52,6 +55,86 @@ def test_newest_replaces_the_waiting_packet_of_the_same_robot_and_kind_alone():
     assert left == [(1, 0), (2, 1), (3, 2), (4, 1)]
     assert cell.usage.dropped == {1: 1}
     assert cell.usage.waited_ns == round((0.6 + 1.8 + 2.7) * MS)  # the newer one has the old place
+
+
+def test_newest_keeps_every_packet_of_others():
+    cell = Cell(RATE, "newest")
+    assert served(cell, (0, -1), (0, -1), (0, -1), (0.1, 0), (0.2, 0)) == [(4, 0)]
+    assert cell.usage.dropped == {0: 1}
+
+
+def test_no_packet_arrives_before_the_soonest_time():
+    cell = Cell(RATE, airtime_ns=MS)
+    cell.delay_ns = 20 * MS
+    shortest_ns = round(HEADER_BYTES * 8e3) + MS  # of an empty packet
+    assert cell.soonest_ns(5 * MS) == 5 * MS + shortest_ns + 20 * MS
+    served(cell, (6, 0), until=7 * MS)
+    assert cell.soonest_ns(7 * MS) == (6 + 2 + 20) * MS
+
+
+def test_the_usage_of_a_period_is_told_and_read_back():
+    cell = Cell(RATE, "fifo", packets_max=3, direction="uplink")
+    served(cell, (0, 0), (0, 1), (0, 2), (0.5, 2), until=10 * MS)
+    told = cell.end_period(10 * MS)
+    assert told == Usage("uplink", 0.01, 3, 375, 3 * MS, 3 * MS, 2 * MS, 2, {2: 1})
+    assert Usage.read({key: str(value) for key, value in told.row().items()}) == told
+    assert cell.usage == Usage("uplink")
+
+
+@pytest.mark.parametrize(("rate", "packets"), [(1e6, 3), (1e3, 1)])
+def test_a_frame_of_a_video_has_the_packets_of_its_rate(rate, packets):
+    cell = Cell(1e9)
+    cell.traffic[-1] = Video(-1, rate, 5 * MS)
+    assert [*cell.advance(70 * MS)] == []  # frames at 5 and 38.3 ms
+    assert (cell.usage.packets, cell.usage.size) == (2 * packets, 2 * packets * 1228)
+
+
+@pytest.mark.parametrize(
+    ("packets_max", "sent"),
+    [
+        # From 10 on, a packet more for each that is confirmed.
+        (1000, [10, 10 + 20, 10 + 20 + 40]),
+        # The sixth packet is dropped: half of 10, and then one more per round trip.
+        (5, [5, 5 + 5, 5 + 5 + 6]),
+    ],
+)
+def test_the_window_of_a_bulk_flow_grows_by_what_is_confirmed(packets_max, sent):
+    cell, told = Cell(12e6, packets_max=packets_max), []  # a packet of 1,500 bytes takes 1 ms
+    cell.traffic[-1] = Bulk(-1, 0)
+    for until in (40, 81, 122):
+        assert [*cell.advance(until * MS)] == []
+        told.append(cell.usage.packets)
+    assert told == sent
+
+
+def cross(onward):
+    """Send two packets of 1 ms through a cell and over links of 20 ms; return the robot's queue."""
+    profile = DirectionProfile(delay_ms=20)
+    links = [LinkDirection(profile, 1, uplink) for uplink in (True, False)]
+    cell = Cell(RATE)
+    queue = CellQueue(3, [cell], [False, False], links, onward)
+    queue.see = lambda *what: seen.append(what)
+    seen = []
+    for number, link in enumerate(links):
+        queue.send(link, (7, 1, number), 125 - HEADER_BYTES, b"", 2 * MS)
+    for at_ns, robot, leave in cell.advance(50 * MS):
+        assert robot == 3
+        leave(at_ns)
+    assert cell.delay_ns == links[0].shortest_ns
+    assert seen == [(True, (7, 1, 0), 2 * MS, 3 * MS), (False, (7, 1, 1), 2 * MS, 4 * MS)]
+    return queue
+
+
+def test_what_leaves_the_cell_is_in_flight_as_long_as_its_link_delays():
+    queue = cross(None)
+    assert queue.next_ns == 23 * MS
+
+
+def test_what_leaves_the_cell_may_be_given_to_another_place():
+    left = []
+    queue = cross(lambda link, arrivals, data: left.append(arrivals))
+    assert left == [(23 * MS,), (24 * MS,)]
+    assert queue.next_ns == NOTHING_NS
 
 
 def test_a_bulk_flow_fills_the_queue_and_halves_its_window_at_a_drop():
