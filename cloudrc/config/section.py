@@ -7,6 +7,7 @@ from __future__ import annotations
 import ast
 import inspect
 from dataclasses import is_dataclass
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -21,6 +22,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 
+@cache
 def attribute_docstrings(owner: type) -> dict[str, str]:
     """Return the text below each attribute of a class: name -> text."""
     body = ast.parse(inspect.getsource(owner)).body[0]
