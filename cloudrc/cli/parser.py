@@ -258,7 +258,7 @@ class _Version(argparse.Action):
 
 
 def build_parser(wanted: Container[str]) -> Parser:
-    """Build the parser of all commands, with the arguments of the `wanted` commands only.
+    """Build the parser of the `wanted` commands; if none is one of ours, of all, without arguments.
 
     The function imports only the modules of these commands.
     """
@@ -277,7 +277,8 @@ def build_parser(wanted: Container[str]) -> Parser:
     about = "print version and hash of the code"
     parser.add_argument("--version", action=_Version, nargs=0, help=about)
     commands = parser.add_subparsers(dest="command", help=argparse.SUPPRESS, prog=typed)
-    for name, line in COMMANDS.items():
+    chosen = {name: line for name, line in COMMANDS.items() if name in wanted}
+    for name, line in (chosen or COMMANDS).items():
         command = commands.add_parser(name, help=line, description=_sentence(line))
         if name in wanted:
             module = _find_command(name)
