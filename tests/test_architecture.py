@@ -10,6 +10,7 @@ from collections import Counter
 from functools import cache
 from pathlib import Path
 
+import pytest
 from importlinter.cli import lint_imports
 
 from tests.support.commands import python
@@ -38,6 +39,20 @@ def trees():
     return {path: ast.parse(path.read_text()) for path in FILES}
 
 
+@cache
+def nodes_of(tree):
+    """Return all nodes of a tree: to walk over them takes longer than each check."""
+    return tuple(ast.walk(tree))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def trees_are_forgotten():
+    """Let no later garbage collection visit a million nodes."""
+    yield
+    for kept in (trees, nodes_of, imports):
+        kept.cache_clear()
+
+
 def place_of(path):
     return path.relative_to(PACKAGE).as_posix()
 
@@ -46,7 +61,7 @@ def place_of(path):
 def imports(tree):
     """Return the names of all imported modules, anywhere in the file."""
     found = set()
-    for node in ast.walk(tree):
+    for node in nodes_of(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -71,7 +86,7 @@ def test_no_text_of_the_core_names_a_guest():
         f"{place_of(path)}: {node.value}"
         for path, tree in trees().items()
         if not path.relative_to(ROOT).as_posix().startswith(knowing)
-        for node in ast.walk(tree)
+        for node in nodes_of(tree)
         if isinstance(node, ast.Constant) and str(node.value).startswith(guests)
     }
     assert named == set()
@@ -105,7 +120,7 @@ def test_imported_and_declared_packages_are_the_same():
 def test_no_file_and_no_function_is_too_long():
     long = {place_of(path) for path in FILES if path.read_text().count("\n") > 500}
     for path, tree in trees().items():
-        for node in ast.walk(tree):
+        for node in nodes_of(tree):
             function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
             if function and node.end_lineno - node.lineno >= 50:
                 long.add(f"{place_of(path)}: {node.name}")
@@ -121,7 +136,7 @@ NO_OTHER_NAME = {"_address", "_add_info"}
 def private_of_others(parsed):
     """Return the private names that no file of the package gives to anything, and imported ones."""
     used, own = set(), set()
-    for node in (node for tree in parsed for node in ast.walk(tree)):
+    for node in (node for tree in parsed for node in nodes_of(tree)):
         match node:
             case ast.Attribute(attr=name, ctx=ast.Load()):
                 used.add(name)

@@ -4,6 +4,8 @@
 
 import json
 
+import pytest
+
 from cloudrc.link.library import read_profile
 
 SHORT = "--set link.profile=handover --set mission.steps.count=1"
@@ -14,6 +16,7 @@ def rows_of(folder):
     return [json.loads(line) for line in (folder / "rows.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.usefixtures("one_core")
 def test_seeds_over_one_time_line_are_told_and_begin_at_0(call, tmp_path):
     found = {}
     for start in ("null", "random"):

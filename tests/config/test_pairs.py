@@ -89,10 +89,13 @@ def loads(file, *settings):
 
 
 def valid_settings(file):
-    """Return a setting for each key that has a value with which the experiment loads."""
+    """Return a setting for each key that has a value with which the experiment loads: the last."""
     keys = [key for key in FORMS if "downlink" not in key]
-    tried = (f"{key}={json.dumps(value)}" for key in keys for value in values(key))
-    return [*{key_of(one): one for one in tried if loads(file, one)}.values()]
+    found = []
+    for key in keys:
+        tried = (f"{key}={json.dumps(value)}" for value in reversed([*values(key)]))
+        found += next(([one] for one in tried if loads(file, one)), [])
+    return found
 
 
 def blames_another_key(file, *settings):

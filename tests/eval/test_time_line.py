@@ -39,7 +39,7 @@ def test_a_link_that_does_not_change_has_no_time_line():
 
 def test_handover_in_cartpole_as_drawn(law, evaluate, tmp_path):
     out = tmp_path / "o"
-    words = "--link handover --seeds 20 --policy".split()
+    words = "--link handover --seeds 20 --max-steps 250 --policy".split()
     evaluate(*words, law(), "--out", out)
     rows = [json.loads(line) for line in (out / "rows.jsonl").read_text().splitlines()]
     rows = [each for each in rows if each["point"]["executor"] == "newest"]

@@ -16,7 +16,7 @@ SETTINGS = {
     "constant": CONSTANT,
     "reordered": ("link.profile=paper-p3",),
     "in order of arrival": ("link.profile=paper-p3", "tunnel.order=arrival"),
-    "blackouts": ("link.profile=handover",),
+    "blackouts": ("link.profile=lte", "link.both.blackouts=[{start_s: 1, duration_s: 0.3}]"),
     "computes": ("link.profile=lte", "cloud.compute_ms=7"),
     "waits at a bottleneck": ("link.profile=lte", "link.uplink.rate_kbit=300"),
     "radio": ("link.profile=5g-sa", "link.uplink.rate_kbit=900"),
@@ -26,7 +26,7 @@ SETTINGS = {
 
 @cache
 def records(*settings):
-    """Fly for 8 s; return the records of world and of cloud."""
+    """Fly for 4 s; return the records of world and of cloud."""
     experiment = load_experiment("hover", settings)
     _, _, teleop, run = assembly.assemble(experiment)
     found = [], []
@@ -35,7 +35,7 @@ def records(*settings):
         for records, more in zip(found, new, strict=True):
             records += more
 
-    run.fly(lambda: teleop.over, 8000 * MS, sink)
+    run.fly(lambda: teleop.over, 4000 * MS, sink)
     return found
 
 
