@@ -21,7 +21,7 @@ from cloudrc.endpoint import Endpoint
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.queue import PacketQueue
 from cloudrc.messages import Datagram, Passed
-from cloudrc.records import LinkWait, Record
+from cloudrc.records import CellWait, LinkWait, Record
 from cloudrc.tunnel.codec import Kind, peek
 
 if TYPE_CHECKING:
@@ -33,6 +33,8 @@ CPU_CLOCK = time.thread_time_ns
 """Clock of this thread's processor time [ns]; a flight that depends on it is not repeatable."""
 PERIOD_NS = 100_000_000
 """Virtual time between two calls of `sink` and of `until` [ns]."""
+WATCHED = Kind.TELEMETRY, Kind.COMMAND
+"""Kinds of datagrams whose waits are recorded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,10 +94,9 @@ class VirtualRun:
         self.in_flight = PacketQueue() if in_flight is None else in_flight
         self.now_ns = 0
         self._waits = list[Record]()
-        uplink.watch, downlink.watch = (
-            partial(self._note_wait, True),
-            partial(self._note_wait, False),
-        )
+        self.in_flight.watch = self._note_cell
+        uplink.watch = partial(self._note_link, True)
+        downlink.watch = partial(self._note_link, False)
 
     def fly(self, until: Callable[[], bool], limit_ns: int, sink: Sink) -> None:
         """Run until `until()` is true or virtual time reaches `limit_ns` [ns].
@@ -162,7 +163,15 @@ class VirtualRun:
                     self._send(datagrams, self._downlink)
         self.now_ns = end_ns
 
-    def _note_wait(
+    def _note_cell(
+        self, uplink: bool, header: tuple[int, int, int], sent_ns: int, now_ns: int
+    ) -> None:
+        """Record how long telemetry or a command was in the cell."""
+        kind, epoch, counter = header
+        if kind in WATCHED:
+            self._waits.append(CellWait(now_ns, uplink, epoch, counter, now_ns - sent_ns))
+
+    def _note_link(
         self,
         uplink: bool,
         packet: tuple[int, int, int],
@@ -172,7 +181,7 @@ class VirtualRun:
     ) -> None:
         """Record where telemetry or a command waits in the link."""
         epoch, kind, counter = packet
-        if kind in (Kind.TELEMETRY, Kind.COMMAND):
+        if kind in WATCHED:
             waits_ns = queue_ns, *(radio or (0, 0, 0))
             self._waits.append(LinkWait(now_ns, uplink, epoch, counter, *waits_ns))
 

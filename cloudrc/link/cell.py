@@ -279,12 +279,7 @@ class Bulk:
 
 
 class CellQueue(PacketQueue):
-    """The packets of a robot in flight behind a cell; new ones are sent through the cell.
-
-    Attributes:
-        see: Function that gets each packet that leaves the cell: whether it is of the uplink, its
-            header (kind, epoch, counter), when it was sent and when it leaves [ns].
-    """
+    """The packets of a robot in flight behind a cell; new ones are sent through the cell."""
 
     def __init__(
         self,
@@ -303,7 +298,6 @@ class CellQueue(PacketQueue):
         self._robot, self._cells, self._orders = robot, (*cells, *cells)[:2], orders
         self._downlink, self._onward = links[1], onward or self.put
         self._last_ns, self._numbers = [0, 0], 0
-        self.see: Callable[[bool, tuple[int, int, int], int, int], None] | None = None
         for cell, link in zip(self._cells, links, strict=True):
             cell.delay_ns = min(cell.delay_ns, link.shortest_ns)
 
@@ -333,8 +327,8 @@ class CellQueue(PacketQueue):
         now_ns: int,
     ) -> None:
         """Take a packet that has left the cell at `now_ns` [ns]; `sent` is its header, and when."""
-        if self.see is not None:
-            self.see(way == 0, *sent, now_ns)
+        if self.watch is not None:
+            self.watch(way == 0, *sent, now_ns)
         arrival_ns = now_ns + delay_ns
         if self._orders[way]:
             arrival_ns = self._last_ns[way] = max(arrival_ns, self._last_ns[way])

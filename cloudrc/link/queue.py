@@ -8,7 +8,7 @@ and no socket.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from heapq import heappop, heappush
 from typing import Any
 
@@ -27,6 +27,8 @@ class PacketQueue:
         next_ns: Time of the next arrival [ns]; `NOTHING_NS` if no packet is in flight.
         lost: Number of packets that the link has lost.
         overflow: Number of copies that were dropped because the queue was full.
+        watch: Is told of each packet that leaves a cell before the link: whether it is of the
+            uplink, its header (kind, epoch, counter), when it was sent and when it leaves [ns].
     """
 
     def __init__(self, capacity: int | None = None) -> None:
@@ -37,6 +39,7 @@ class PacketQueue:
         self._sent = 0
         self.next_ns = NOTHING_NS
         self.lost = self.overflow = 0
+        self.watch: Callable[[bool, tuple[int, int, int], int, int], None] | None = None
 
     def send(
         self,

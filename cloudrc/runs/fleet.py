@@ -29,7 +29,7 @@ from cloudrc.link.cell import Cell, CellQueue
 from cloudrc.link.follow import make_folder
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import cut_to_last_mission, merge
-from cloudrc.records import CellWait, Record
+from cloudrc.records import Record
 from cloudrc.report.document import ENVIRONMENT_FILE, Run, environment_document
 from cloudrc.report.fleet import FleetFlown, fleet_document
 from cloudrc.report.folder import ROBOT, read_cell, robots_in
@@ -38,7 +38,6 @@ from cloudrc.runs.fly import Report, VirtualRecorder, end_of, explaining, naming
 from cloudrc.runs.interrupts import raise_if_interrupted
 from cloudrc.runs.own_files import hash_files
 from cloudrc.text import csv_table
-from cloudrc.tunnel.codec import Kind
 
 AFTER_NS = 200_000_000
 """Time after its mission for which a robot is recorded [ns]; it flies on until all are over."""
@@ -210,22 +209,12 @@ def _build(
         )
         cores.clouds.append(compute)
     _, cloud, teleop, run = assembly.assemble(robot, queue=queue, compute=compute)
-    waits = list[Record]()
-
-    def see_wait(uplink: bool, header: tuple[int, int, int], sent_ns: int, now_ns: int) -> None:
-        kind, epoch, counter = header
-        if kind in (Kind.TELEMETRY, Kind.COMMAND):
-            waits.append(CellWait(now_ns, uplink, epoch, counter, now_ns - sent_ns))
-
-    if isinstance(run.in_flight, CellQueue):
-        run.in_flight.see = see_wait
 
     def finish(now_ns: int) -> None:
         cloud.finish(run.cloud_clock.at(now_ns))
 
     def see(from_world: list[Record], from_cloud: list[Record]) -> None:
-        sink([*from_world, *waits], run.on_world_clock(from_cloud))
-        waits.clear()
+        sink(from_world, run.on_world_clock(from_cloud))
 
     limit_ns = round(assembly.flight_limit(robot) * 1e9)
     return Member(run, lambda: teleop.over, limit_ns, see)

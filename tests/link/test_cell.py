@@ -113,7 +113,7 @@ def cross(onward):
     links = [LinkDirection(profile, 1, uplink) for uplink in (True, False)]
     cell = Cell(RATE)
     queue = CellQueue(3, [cell], [False, False], links, onward)
-    queue.see = lambda *what: seen.append(what)
+    queue.watch = lambda *what: seen.append(what)
     seen = []
     for number, link in enumerate(links):
         queue.send(link, (7, 1, number), 125 - HEADER_BYTES, b"", 2 * MS)
