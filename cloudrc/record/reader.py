@@ -15,16 +15,19 @@ from array import array
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from io import BufferedReader
+from io import BufferedReader, BytesIO
 from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
 from shlex import quote
+from struct import Struct
 from typing import IO, Any
 
 from mcap import records as mcap
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.opcode import Opcode
+from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
 from cloudrc.errors import BadInputError, to_one_line
@@ -42,6 +45,14 @@ KINDS = {
 }
 """First bytes of a file that is not MCAP -> text of the error about the file."""
 
+
+_RECORD, _MESSAGE = Struct("<BQ"), Struct("<HIQQ")
+"""Begin of a record: opcode, length [bytes]; of a message: channel, sequence, two times [ns]."""
+_DEFINITIONS: dict[int, type[mcap.Channel | mcap.Schema]] = {
+    Opcode.CHANNEL.value: mcap.Channel,
+    Opcode.SCHEMA.value: mcap.Schema,
+}
+_IS_MESSAGE = Opcode.MESSAGE.value
 
 TRIM_EVERY = 20_000
 """Number of messages after which a reader of a file's end removes older ones [count]."""
@@ -92,7 +103,9 @@ class _Reader:
     def read(self) -> Content:
         """Read the file; raise a NothingReadableError if damage precedes its first message."""
         stream: Any = self._file  # mcap calls nothing but `read`
-        reader = StreamReader(stream, validate_crcs=True, record_size_limit=self._file.size)
+        size = self._file.size
+        options: Any = {"emit_chunks": True, "validate_crcs": True, "record_size_limit": size}
+        reader = StreamReader(stream, **options)
         position = 0  # end of the last record that was read [bytes]
         fault, holes = "", set[Hole]()
         try:
@@ -149,8 +162,10 @@ class _Reader:
         content = self.content
         if self._data_ended:
             return
-        if isinstance(record, mcap.Message):
-            self._take_message(record)
+        if isinstance(record, mcap.Chunk):
+            self._take_chunk(record)
+        elif isinstance(record, mcap.Message):
+            self._take_message(record.channel_id, record.sequence, record.log_time, record.data)
         elif isinstance(record, mcap.Schema):
             self._schemas[record.id] = record
         elif isinstance(record, mcap.Channel):
@@ -162,8 +177,23 @@ class _Reader:
         elif isinstance(record, mcap.DataEnd):
             self._data_ended = True
 
-    def _take_message(self, message: mcap.Message) -> None:
-        number = message.channel_id
+    def _take_chunk(self, chunk: mcap.Chunk) -> None:
+        """Store the records of a chunk; mcap takes several times as long for each message."""
+        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+        data, at = stream.read(size), 0
+        while at < size:
+            opcode, length = _RECORD.unpack_from(data, at)
+            at += _RECORD.size
+            end = at + length
+            if opcode == _IS_MESSAGE:
+                number, sequence, log_time, _ = _MESSAGE.unpack_from(data, at)
+                self._take_message(number, sequence, log_time, data[at + _MESSAGE.size : end])
+            elif opcode in _DEFINITIONS:
+                definition = ReadDataStream(BytesIO(data[at:end]))
+                self._take(_DEFINITIONS[opcode].read(definition))
+            at = end
+
+    def _take_message(self, number: int, sequence: int, log_time: int, data: bytes) -> None:
         channel = self._channels[number]
         if number not in self._ours:
             self._ours[number] = self._is_ours(channel)
@@ -171,20 +201,20 @@ class _Reader:
             return
         if channel.topic in VIEWS:
             if self._take_block is None:
-                self.content.views.append((channel.topic, message.log_time, message.data))
+                self.content.views.append((channel.topic, log_time, data))
             return
         self._counts[channel.topic] += 1
         if channel.topic not in self._topics:
             return
-        self.content.messages.append((channel.topic, message.log_time, message.data))
-        self._sequences.append(message.sequence)
+        self.content.messages.append((channel.topic, log_time, data))
+        self._sequences.append(sequence)
         if len(self._sequences) < self._trim_at:
             return
         if self._take_block is not None:
             self._take_block(self.content.messages[:-1])
             del self.content.messages[:-1], self._sequences[:-1]
         elif self._last_ns is not None:
-            self._trim(message.log_time - self._last_ns)
+            self._trim(log_time - self._last_ns)
 
     def _trim(self, first_ns: int) -> None:
         """Remove the messages before a log time [ns]: memory then holds twice the kept ones."""
