@@ -134,6 +134,17 @@ SHOWN = (
         ),
     ),
     Shown(
+        "docs/timeline.md",
+        "cloudrc run gap --mode virtual --set link.profile=lte --set cloud.perception_ms=60 &&"
+        " cloudrc timeline runs/latest",
+        10.0,
+        (
+            "uplink of the scan mean 33.16 p99 81.40 ms",
+            "perception computes mean 60.00 p99 60.00 ms",
+            "age of a scan when the robot acts on it mean 120.95 p99 177.68 ms",
+        ),
+    ),
+    Shown(
         "docs/definitions.md",
         "cloudrc run paper-verbatim --mode virtual --report none --set link.profile=paper-p3",
         5.0,

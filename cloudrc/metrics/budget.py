@@ -19,8 +19,9 @@ import numpy as np
 from cloudrc.messages import GuardState
 from cloudrc.metrics.age import describe
 from cloudrc.metrics.control import ages_at_actuator
-from cloudrc.metrics.descriptions import AGE_STAGES
+from cloudrc.metrics.descriptions import AGE_STAGES, SCAN_STAGES
 from cloudrc.metrics.flight import Array, Columns, Flight, add_measures, select
+from cloudrc.metrics.perception import acted
 from cloudrc.record.columns import Column, datagrams, join
 from cloudrc.records import UNSENT
 
@@ -136,7 +137,7 @@ def _stage(
     at_cloud: bool = False,
     is_extra: bool = False,
 ) -> Stage:
-    return Stage(name, AGE_STAGES[name], end, at_cloud, is_extra)
+    return Stage(name, (AGE_STAGES | SCAN_STAGES)[name], end, at_cloud, is_extra)
 
 
 STAGES = (
@@ -167,7 +168,7 @@ NUMBER = "budget_"
 """Begin of the names of the metrics; the name of a stage follows."""
 NEEDED = (
     *("/telemetry", "/uplink_delay", "/delay_estimate", "/downlink_delay", "/command_applied"),
-    *("/guard", "/mission", "/left", "/cell_wait", "/link_wait"),
+    *("/guard", "/mission", "/left", "/cell_wait", "/link_wait", "/perception"),
 )
 """Topics that the budget of a flight needs."""
 ENDS = {
@@ -192,6 +193,7 @@ class Budget(NamedTuple):
     ended: Array = np.zeros(0, "U1")  # key of `ENDS`, "" for a command that the robot followed
     average: float | None = None  # age of what the robot acts on, averaged over time [s]
     notes: tuple[str, ...] = ()  # what is told together or left out, and why
+    scans: Budget | None = None  # of the scans on which the robot acted, up to then
 
     @property
     def followed(self) -> Array:
@@ -218,6 +220,7 @@ class Budget(NamedTuple):
             "commands": ns.shape[1],
             "ended": {end: counts[end] for end in ENDS if counts[end]},
             "notes": [*self.notes],
+            **({"scans": self.scans.document} if self.scans else {}),
         }
 
 
@@ -236,8 +239,9 @@ def budget_of(flight: Flight) -> Budget:
     bases_ns = np.concatenate([applied["basis_stamp_ns"], made["basis_stamp_ns"]])
     metadata = flight.recording.metadata
     method = metadata.get("clock_offset_method", "same clock")
-    found = _cut(Commands(flight, known, bases_ns), len(applied["epoch"]), method)
+    found = _cut(STAGES, Commands(flight, known, bases_ns), len(applied["epoch"]), method)
     found = found._replace(
+        scans=_scans_of(flight, method),
         numbers=known,
         ended=np.concatenate([np.full(len(applied["epoch"]), ""), ended]),
         average=describe(ages_at_actuator(flight)).get("mean"),
@@ -281,7 +285,32 @@ def endings(flight: Flight) -> tuple[Columns, Array]:
     return select(made, rows), ended
 
 
-def _cut(commands: Commands, count: int, method: str) -> Budget:
+def _scans_of(flight: Flight, method: str) -> Budget | None:
+    """Cut the scans on which the robot acted into their stages; None without any.
+
+    `method` is that of `_cut`.
+    """
+    seen, applied = acted(flight)
+    numbers = datagrams(applied)
+    if not len(numbers):
+        return None
+    done_ns = seen["stamp_ns"] - seen["hold_ns"]
+    begun_ns = done_ns - seen["compute_ns"]
+    arrived_ns = begun_ns - seen["wait_ns"]
+    made = [each.name for each in STAGES].index("queue") + 1
+    stages = (
+        _stage("scan_uplink", lambda _: arrived_ns, at_cloud=True),
+        _stage("scan_wait", lambda _: begun_ns, at_cloud=True),
+        _stage("scan_compute", lambda _: done_ns, at_cloud=True),
+        _stage("scan_hold", lambda c: c.at("/delay_estimate", c.numbers), at_cloud=True),
+        *STAGES[made:],
+    )
+    commands = Commands(flight, numbers, seen["seen_stamp_ns"])
+    found = _cut(stages, commands, len(numbers), method)
+    return found._replace(numbers=numbers, ended=np.full(len(numbers), ""))
+
+
+def _cut(all_stages: Sequence[Stage], commands: Commands, count: int, method: str) -> Budget:
     """Cut commands into stages; a stage of which nothing is known is a part of the next one.
 
     The robot followed the first `count` of them. `method` tells how cloud's stamps were converted
@@ -289,7 +318,7 @@ def _cut(commands: Commands, count: int, method: str) -> Budget:
     """
     stages, cuts, parts = list[Stage](), [commands.basis_ns], list[Stage]()
     notes = list[str]()
-    for stage in STAGES:
+    for stage in all_stages:
         end_ns = stage.end(commands)
         is_known = end_ns != UNKNOWN_NS
         if not is_known[:count].any():
@@ -336,10 +365,14 @@ def _on_one_clock(found: Budget, method: str) -> Budget:
 
 def _mean(name: str, flight: Flight) -> float | None:
     found = budget_of(flight)
+    if name in SCAN_STAGES and found.scans:
+        found = found.scans
     for stage, length_ns in zip(found.stages, np.diff(found.followed, axis=0), strict=True):
         if stage.name == name and len(length_ns):
             return summary(length_ns)["mean"]
     return None
 
 
-add_measures(*((f"{NUMBER}{stage.name}", partial(_mean, stage.name)) for stage in STAGES))
+NAMES = *AGE_STAGES, *SCAN_STAGES
+"""Names of all stages."""
+add_measures(*((f"{NUMBER}{name}", partial(_mean, name)) for name in NAMES))

@@ -49,6 +49,13 @@ AGE_STAGES = {
     "wait": "command waits for the step",
 }
 """Stages of the age of a command, in their order -> in words."""
+SCAN_STAGES = {
+    "scan_uplink": "uplink of the scan",
+    "scan_wait": "scan waits for the perception",
+    "scan_compute": "perception computes",
+    "scan_hold": "setpoint waits for its command",
+}
+"""Stages from a scan to the first command for it, in their order -> in words."""
 DESCRIPTIONS: dict[str, Description] = {}
 """Name in report.json -> description."""
 
@@ -199,6 +206,8 @@ _add(
     ("seen_to_acted_p99", "s", "99th percentile of the time from a scan until the robot acts on "
      "it."),
     ("seen_dropped", "1", "Number of scans in whose place the perception took newer ones."),
+    *((f"budget_{_stage}", "s", f"Mean of a stage of seen_to_acted: {_words}.")
+      for _stage, _words in SCAN_STAGES.items()),
 )  # fmt: skip
 for _way, _words in WAYS.items():
     _add(

@@ -57,7 +57,7 @@ IN_SPITE_OF_HOLES = {
     "cloud_lateness_p99",
     "world_slip",
     "real_time_factor",
-    *(f"{budget.NUMBER}{stage.name}" for stage in budget.STAGES),
+    *(f"{budget.NUMBER}{name}" for name in budget.NAMES),
 }
 """Metrics of a flight with lost messages: means over the rows or steps that are left, and what the
 rest of the recording proves. All other metrics would be wrong: they compute over time, count, or

@@ -7,20 +7,23 @@ from __future__ import annotations
 import numpy as np
 
 from cloudrc.metrics.definitions import age
-from cloudrc.metrics.flight import Array, Flight, add_measures
+from cloudrc.metrics.flight import Array, Columns, Flight, add_measures, select
 from cloudrc.record.columns import datagrams
 from cloudrc.records import UNSENT
 
 
-def acted(flight: Flight) -> tuple[Array, Array]:
-    """Return for each scan on which the robot acted in a flight its stamp, and when it acted [ns].
+def acted(flight: Flight) -> tuple[Columns, Columns]:
+    """Find the scans on which the robot acted in a flight.
 
-    That is when world applied the first command from the setpoint that the perception made of the
-    scan. A setpoint whose commands are all lost, or that the next one replaced before, has none.
+    A setpoint whose commands are all lost, or that the next one replaced before, has no command.
+
+    Returns:
+        Their rows of /perception; and for each of them the row of /command_applied of the first
+        command that world applied from the setpoint which the perception made of the scan.
     """
     seen, applied = flight.during("/perception"), flight.during("/command_applied")
-    steers = seen["counter"] != UNSENT
-    first = datagrams({name: seen[name][steers] for name in ("epoch", "counter")})
+    seen = select(seen, seen["counter"] != UNSENT)
+    first = datagrams(seen)
     numbers = datagrams(applied)
     order = np.argsort(numbers, kind="stable")
     at = np.searchsorted(numbers, first, sorter=order)
@@ -29,13 +32,12 @@ def acted(flight: Flight) -> tuple[Array, Array]:
     known = at < len(numbers)
     rows = order[at[known]]
     same = (numbers[rows] < ends[known]) & (numbers[rows] >> 32 == first[known] >> 32)
-    stamps_ns: Array = seen["seen_stamp_ns"][steers][known][same]
-    return stamps_ns, applied["stamp_ns"][rows[same]]
+    return select(seen, np.flatnonzero(known)[same]), select(applied, rows[same])
 
 
 def _seen_to_acted(flight: Flight) -> Array:
-    stamps_ns, applied_ns = acted(flight)
-    ages: Array = age(applied_ns, stamps_ns)
+    seen, applied = acted(flight)
+    ages: Array = age(applied["stamp_ns"], seen["seen_stamp_ns"])
     return ages
 
 

@@ -29,7 +29,9 @@ def write_polar(flight: Flight) -> str:
         scans["ranges"].shape[1]
     )
     goals = _goals(flight)
-    ages = dict(zip(*(stamps_ns.tolist() for stamps_ns in acted(flight)), strict=True))
+    seen, applied = acted(flight)
+    taken_ns, acted_on_ns = seen["seen_stamp_ns"].tolist(), applied["stamp_ns"].tolist()
+    ages = dict(zip(taken_ns, acted_on_ns, strict=True))
     shown: list[dict[str, Any]] = []
     for stamp_ns, ranges in zip(scans["stamp_ns"].tolist(), scans["ranges"], strict=True):
         acted_ns = ages.get(stamp_ns)

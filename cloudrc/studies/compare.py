@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from cloudrc.config.problems import problem_at
 from cloudrc.config.sweep import draft_of
 from cloudrc.errors import CloudrcError, NothingFlownError
-from cloudrc.metrics.budget import NUMBER, STAGES
+from cloudrc.metrics.budget import NAMES, NUMBER
 from cloudrc.metrics.measure import SHIPPED
 from cloudrc.outside.refusal import check_names, naming
 from cloudrc.outside.values import InvalidValueError
@@ -131,7 +131,7 @@ def compare(
 def budget_numbers(pairs: Sequence[Pair]) -> list[str]:
     """Return the metrics of the budget that any flight has, and the age; others take 0 s there."""
     rows = [row for _, *both in pairs for row in both if row["numbers"]]
-    found = [f"{NUMBER}{stage.name}" for stage in STAGES]
+    found = [f"{NUMBER}{name}" for name in NAMES]
     found = [name for name in found if any(name in row["numbers"] for row in rows)]
     for row in rows:
         row["numbers"] = dict.fromkeys(found, 0.0) | row["numbers"]

@@ -13,6 +13,7 @@ from cloudrc.text import table
 
 ROUND_TRIPS = {"rtt": "round trip without the time in world", "loop_delay": "with it"}
 """What cloud alone knows -> in words."""
+SCAN_AGE = "age of a scan when the robot acts on it"
 
 
 def as_text(budget: Mapping[str, Any]) -> str:
@@ -43,6 +44,10 @@ def _lines(budget: Mapping[str, Any]) -> Iterator[str]:
     others = f"; the others: {', '.join(ended)}" if ended else ""
     yield f"  of {budget['commands']} commands that the robot followed{others}"
     yield from (f"  {note}" for note in budget["notes"])
+    if scans := budget.get("scans"):
+        rows = [(each["text"], each) for each in scans["stages"].values()]
+        yield from ("", *_table([*rows, (SCAN_AGE, scans["age"])]))
+        yield f"  of {scans['commands']} scans on which the robot acted"
 
 
 def fleet_text(found: Mapping[str, Any]) -> str:
@@ -64,7 +69,8 @@ def side_by_side(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[dict[str, s
     """Return a table of two runs: of each stage mean and 99th percentile, and the change.
 
     `a` and `b` are the documents of loops, by the names of their robots; a stage that one of them
-    lacks takes no time there. The age comes last.
+    lacks takes no time there. The age comes last; behind it the stages of scans up to the command,
+    if both have scans.
     """
     sides = [*a.values()], [*b.values()]
     for side in sides:
@@ -81,6 +87,13 @@ def side_by_side(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[dict[str, s
     if None not in (one["time_average"], other["time_average"]):
         mean, other_mean = ({"mean": side["time_average"], "p99": None} for side in (one, other))
         rows.append(("time average of the age", mean, other_mean))
+    if (scans := one.get("scans")) and (other_scans := other.get("scans")):
+        rows += [
+            (each["text"], each, other_scans["stages"].get(name, nothing))
+            for name, each in scans["stages"].items()
+            if name not in one["stages"]
+        ]
+        rows.append((SCAN_AGE, scans["age"], other_scans["age"]))
     return [
         {
             "stage": text,

@@ -2,8 +2,9 @@
 
 """Write loops in Chrome's trace format, which Perfetto (ui.perfetto.dev) and Chrome show offline.
 
-Each stage of a command is a slice on a track of the stage, and a flow joins its slices. Slices that
-overlap are on tracks of their own, because a viewer would drop one of two on the same track.
+Each stage of a command is a slice on a track of the stage, and a flow joins its slices. A scan that
+a perception has seen has tracks of its own, and its flow ends in its command. Slices that overlap
+are on tracks of their own, because a viewer would drop one of two on the same track.
 
 Source: "Trace Event Format", Google, 2016; Perfetto, docs/getting-started/other-formats.md.
 """
@@ -12,19 +13,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from itertools import count, pairwise
+from itertools import count, islice, pairwise
 from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
-from cloudrc.metrics.budget import ENDS, UNKNOWN_NS
+from cloudrc.metrics.budget import ENDS, UNKNOWN_NS, Budget
 from cloudrc.timeline.loops import GUARD, MISSION, Loop
 
 IN_FORCE = "command in force"
 """Name of the track behind the last stage."""
 LANES = 1000
 """Largest number of tracks of a stage."""
+COUNTER = 0xFFFFFFFF
+"""Bits of a datagram's number that are its counter."""
 Event = dict[str, Any]
 
 
@@ -51,13 +54,20 @@ class _Tracks:
         self._begin_ns, self._end_ns = span_ns
         used = {each.track for each in loop.marks} | {each.track for each in loop.phases}
         others = sorted(used & {GUARD, MISSION})
-        self._names = [*(each.text for each in loop.budget.stages), IN_FORCE, *others]
+        scan_stages = loop.budget.scans.stages if loop.budget.scans else ()
+        # The other stages of a scan are those of its command.
+        before = [each.text for each in scan_stages if each.name.startswith("scan_")]
+        self._first = len(before)  # track of the first stage of commands
+        self._points = dict[int, list[Event]]()  # datagram of a command -> way of its flow
+        self._names = [*before, *(each.text for each in loop.budget.stages), IN_FORCE, *others]
         self._lanes: list[list[int]] = [[] for _ in self._names]  # end of each lane [ns]
         self._events = list[Event]()
 
     def events(self, name: str) -> Iterator[Event]:
         """Yield the events; the process has a `name`."""
         self._show_commands()
+        if scans := self._loop.budget.scans:
+            self._show_scans(scans)
         for track, at_ns, text in self._loop.marks:
             if self._begin_ns <= at_ns < self._end_ns:
                 self._mark(self._names.index(track), at_ns, text)
@@ -96,27 +106,60 @@ class _Tracks:
 
     def _show_commands(self) -> None:
         budget = self._loop.budget
-        begin_ns = budget.ns[0]
-        rows = np.flatnonzero((begin_ns >= self._begin_ns) & (begin_ns < self._end_ns))
-        for row in rows[begin_ns[rows].argsort(kind="stable")].tolist():
+        for row in self._rows(budget):
             cuts_ns, ended = budget.ns[:, row].tolist(), str(budget.ended[row])
             if not ended:
                 cuts_ns.append(int(self._loop.until_ns[row]))
-            self._show_command(int(budget.numbers[row]) & 0xFFFFFFFF, cuts_ns, ended)
+            number = int(budget.numbers[row])
+            self._points[number] = self._show_command(number & COUNTER, cuts_ns, ended)
 
-    def _show_command(self, counter: int, cuts_ns: list[int], ended: str) -> None:
-        """Show a command as slices, and as a flow through them; `ended` is a key of `ENDS`."""
+    def _rows(self, budget: Budget) -> list[int]:
+        """Return what a budget has of the time that is shown, in its order."""
+        begin_ns = budget.ns[0]
+        rows = np.flatnonzero((begin_ns >= self._begin_ns) & (begin_ns < self._end_ns))
+        found: list[int] = rows[begin_ns[rows].argsort(kind="stable")].tolist()
+        return found
+
+    def _show_command(self, counter: int, cuts_ns: list[int], ended: str) -> list[Event]:
+        """Show a command as slices, and as a flow through them; return where the flow passes.
+
+        `ended` is a key of `ENDS`.
+        """
         name = f"#{counter}" if ended != "withheld" else "withheld"
         about = {"ended": ENDS[ended]} if ended else {}
-        points, at_ns = list[Event](), cuts_ns[0]
-        for track, (begin_ns, end_ns) in enumerate(pairwise(cuts_ns)):
-            if UNKNOWN_NS not in (begin_ns, end_ns) and end_ns > begin_ns:
-                tid, at_ns = self._slice(track, begin_ns, end_ns, name, **about), end_ns
-                points.append({"ph": "t", "tid": tid, "ts": self._us(begin_ns)})
+        points = self._slices(self._first, cuts_ns, name, **about)
         if ended:
-            known = sum(each != UNKNOWN_NS for each in cuts_ns)
-            self._mark(min(known, len(cuts_ns) - 1) - 1, at_ns, f"{name} {ENDS[ended]}")
-        if len(points) > 1:
-            points[0]["ph"], points[-1]["ph"], points[-1]["bp"] = "s", "f", "e"
-            flow = {"cat": "loop", "name": "command", "id": next(self._flows)}
-            self._events += ({**point, **flow} for point in points)
+            known = [each for each in cuts_ns if each != UNKNOWN_NS]
+            last = self._first + min(len(known), len(cuts_ns) - 1) - 1
+            self._mark(last, max(known), f"{name} {ENDS[ended]}")
+        self._flow("command", points)
+        return points
+
+    def _show_scans(self, scans: Budget) -> None:
+        """Show scans as slices, and as flows that end in the slices of their commands."""
+        for row in self._rows(scans):
+            number, cuts_ns = int(scans.numbers[row]), scans.ns[: self._first + 1, row].tolist()
+            points = self._slices(0, cuts_ns, f"scan for #{number & COUNTER}")
+            made = self._us(cuts_ns[-1])
+            then = (each for each in self._points.get(number, ()) if each["ts"] >= made)
+            self._flow("scan", [*points, *islice(then, 1)])
+
+    def _slices(self, first: int, cuts_ns: list[int], name: str, **about: Any) -> list[Event]:
+        """Show what is between two cuts each as a slice, from the track `first` on.
+
+        Return the points of a flow through the slices.
+        """
+        points = list[Event]()
+        for track, (begin_ns, end_ns) in enumerate(pairwise(cuts_ns), first):
+            if UNKNOWN_NS not in (begin_ns, end_ns) and end_ns > begin_ns:
+                tid = self._slice(track, begin_ns, end_ns, name, **about)
+                points.append({"tid": tid, "ts": self._us(begin_ns)})
+        return points
+
+    def _flow(self, name: str, points: list[Event]) -> None:
+        """Join points, at least two, by arrows."""
+        if len(points) < 2:
+            return
+        flow = {"cat": "loop", "name": name, "id": next(self._flows)}
+        ends = {"ph": "s"}, *[{"ph": "t"}] * (len(points) - 2), {"ph": "f", "bp": "e"}
+        self._events += ({**point, **end, **flow} for point, end in zip(points, ends, strict=True))

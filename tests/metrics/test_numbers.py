@@ -10,6 +10,7 @@ import pytest
 from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
+from cloudrc.metrics.descriptions import SCAN_STAGES
 from cloudrc.metrics.flight import Flight
 from cloudrc.metrics.measure import SHIPPED, measure_all
 from cloudrc.metrics.mission import unconfirmed
@@ -331,7 +332,7 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
     others = {"recorder_dropped", "final_error", "controller_gaps", "yaw_error", "age_violation"}
     others |= {"commands_withheld", "seen_dropped", "seen_to_acted", "seen_to_acted_p99"}
     waits = [f"{way}_{name}" for way in WAYS for name in ("cell", "rate", "grant", "repeat")]
-    others |= {f"budget_{name}" for name in ("compute", "uplink_request", *waits)}
+    others |= {f"budget_{name}" for name in ("compute", "uplink_request", *waits, *SCAN_STAGES)}
     assert set(SHIPPED) - set(numbers) == REAL_TIME | OF_RELAYS | resting | others
     for name, number in numbers.items():
         assert set(number.unit) <= set("smNJB12^/ "), name

@@ -40,5 +40,6 @@ def applied(now_ns, counter, epoch=1):
     ],
 )
 def test_the_robot_acts_with_the_first_command_from_the_setpoint(cloud, world, found):
-    stamps_ns, applied_ns = acted(Flown(world, cloud))
-    assert dict(zip(stamps_ns.tolist(), applied_ns.tolist(), strict=True)) == found
+    seen, acting = acted(Flown(world, cloud))
+    pairs = zip(seen["seen_stamp_ns"].tolist(), acting["stamp_ns"].tolist(), strict=True)
+    assert dict(pairs) == found

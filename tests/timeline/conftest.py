@@ -25,9 +25,9 @@ SETTINGS = {
 
 
 @cache
-def records(*settings):
+def records(*settings, experiment="hover"):
     """Fly for 4 s; return the records of world and of cloud."""
-    experiment = load_experiment("hover", settings)
+    experiment = load_experiment(experiment, settings)
     _, _, teleop, run = assembly.assemble(experiment)
     found = [], []
 
@@ -46,9 +46,9 @@ def write(path, records, clock, clock_id="one"):
     return path
 
 
-def flight_of(folder, *settings, ahead_ns=0):
+def flight_of(folder, *settings, ahead_ns=0, experiment="hover"):
     """Return a recorded flight; cloud's clock is ahead of world's."""
-    world, cloud = records(*settings)
+    world, cloud = records(*settings, experiment=experiment)
     write(folder / "world.mcap", world, "world")
     later = [each._replace(stamp_ns=each.stamp_ns + ahead_ns) for each in cloud]
     write(folder / "cloud.mcap", later, "cloud", "another" if ahead_ns else "one")

@@ -10,6 +10,7 @@ import pytest
 from cloudrc.messages import GuardState
 from cloudrc.metrics.budget import NO_CLOCK, ONE_END, budget_of
 from cloudrc.metrics.measure import SHIPPED
+from cloudrc.metrics.perception import acted
 from cloudrc.records import Arrival, GuardChange
 from cloudrc.timeline.loops import of_flight
 from cloudrc.timeline.read import read_flight
@@ -47,6 +48,33 @@ def test_stages_add_up_to_the_age_of_each_command(tmp_path, settings):
     made = flight.during("/delay_estimate")
     missing = len(made["epoch"]) - document["commands"] - sum(document["ended"].values())
     assert -1 <= missing <= 15, "under way as the flight begins or ends"
+
+
+@pytest.mark.parametrize("perception_ms", [70, 130])
+def test_stages_of_scans_add_up_to_seen_to_acted(tmp_path, perception_ms):
+    """Scans arrive at 33 ms of each 100 ms; commands leave at 8 ms of each 10 ms.
+
+    The perception is done 5 ms before a command. One that takes 130 ms makes scans wait.
+    """
+    settings = f"cloud.perception_ms={perception_ms}", *CONSTANT
+    flight = flight_of(tmp_path, *settings, experiment="gap")
+    seen, applied = acted(flight)
+    lengths = np.diff(budget_of(flight).scans.followed, axis=0)
+    assert lengths.min() >= 0
+    assert len(seen["stamp_ns"]) > 20
+    assert (lengths.sum(axis=0) == applied["stamp_ns"] - seen["seen_stamp_ns"]).all()
+    document = budget_of(flight).document
+    found = document["scans"]
+    measured = SHIPPED["seen_to_acted"].measure(flight)
+    assert found["age"]["mean"] == pytest.approx(measured, abs=1e-9)
+    means = {name: each["mean"] * 1e3 for name, each in found["stages"].items()}
+    own = {"scan_uplink": 33, "scan_compute": perception_ms, "scan_hold": 5}
+    known = {**own, "downlink": 21, "wait": 1}
+    assert {name: means[name] for name in known} == pytest.approx(known, abs=1e-9)
+    assert (means["scan_wait"] > 0) == (perception_ms > 100)
+    assert SHIPPED["budget_scan_hold"].measure(flight) * 1e3 == means["scan_hold"]
+    assert "waits for the perception" in as_text(document)
+    assert "scans" not in budget_of(flight_of(tmp_path, *CONSTANT)).document
 
 
 def test_constant_delays_give_the_delays_and_the_phases_of_the_periods(tmp_path):

@@ -58,6 +58,22 @@ def test_the_file_keeps_the_rules_of_its_format(tmp_path, settings):
     assert min(each["ts"] for each in later if each["ph"] in "stf") >= 1e6
 
 
+def test_a_scan_has_slices_of_its_own_and_leads_to_its_command(tmp_path):
+    settings = "cloud.perception_ms=70", *SETTINGS["constant"]
+    loop = of_flight(flight_of(tmp_path, *settings, experiment="gap"))
+    events = json.loads(write_trace({"loop": loop}, 1.0, 2.0))["traceEvents"]
+    _, flows = check_rules(events)
+    name = next(each["name"] for each in events if each["name"].startswith("scan for"))
+    slices = [each for each in events if each["name"] == name]
+    assert [each["dur"] for each in slices] == [33_000, 70_000, 5_000]
+    flow = next(each for each in flows.values() if each[0]["name"] == "scan")
+    assert flow[0]["ts"] == slices[0]["ts"]
+    assert flow[3]["ts"] == slices[2]["ts"] + 5_000
+    command = name.removeprefix("scan for ")
+    place = flow[3]["tid"], flow[3]["ts"]
+    assert command in [each["name"] for each in events if (each["tid"], each.get("ts")) == place]
+
+
 def test_slices_of_a_command_are_its_stages(tmp_path):
     loop = of_flight(flight_of(tmp_path, *SETTINGS["constant"]))
     events = json.loads(write_trace({"loop": loop}, 0.0, 1.0))["traceEvents"]

@@ -19,16 +19,30 @@ CAPTION = (
     "Budget of the age. Each bar is the mean duration of a stage of the commands that the robot "
     "followed; it begins where the stage before ends, so the last one ends at the mean age when a "
     "command begins to act. The line behind a bar ends at the 99th percentile of its stage. The "
-    "dashed line is the age averaged over time: a command ages on while the robot follows it."
+    "dashed line is the age averaged over time: a command ages on while the robot follows it. "
+    "With a perception, the lower bars are the way from a scan until the robot acts on it."
 )
 
 
 def draw(subject: Subject) -> Figure:
     """Draw the stages of the commands that the robot followed."""
     found = budget_of(subject.flight).document
+    parts = [each for each in (found, (found or {}).get("scans")) if each]
+    counts = [len(each["stages"]) for each in parts] or [1]
+    height = 0.9 * len(counts) + 0.28 * sum(counts)
+    figure = new_figure(height, subject.look.width)
+    ratios = {"height_ratios": counts}
+    every = figure.subplots(len(counts), sharex=True, squeeze=False, gridspec_kw=ratios).flat
+    for axes, each in zip(every, parts or [None], strict=True):
+        _draw_stages(axes, each)
+    every[len(counts) - 1].set_xlabel("time since the measurement (ms)")
+    legend_above(every[0])
+    return figure
+
+
+def _draw_stages(axes: Axes, found: dict[str, Any] | None) -> None:
+    """Draw the stages of a budget, which may be unknown."""
     stages = [*found["stages"].values()] if found else []
-    figure = new_figure(0.9 + 0.28 * max(len(stages), 1), subject.look.width)
-    axes = figure.subplots()
     begins = accumulate((1e3 * each["mean"] for each in stages), initial=0.0)
     drawn = zip(stages, begins, cycle(COLOURS), strict=False)
     for row, (each, begin, colour) in enumerate(drawn):
@@ -40,9 +54,6 @@ def draw(subject: Subject) -> Figure:
         look: dict[str, Any] = {"color": style.BLACK, "lw": 0.9, "ls": "--"}
         axes.axvline(1e3 * found["time_average"], label="time average of the age", **look)
     axes.set_xlim(left=0.0)
-    axes.set_xlabel("time since the measurement (ms)")
-    legend_above(axes)
-    return figure
 
 
 def _draw_stage(axes: Axes, row: int, begin: float, mean: float, p99: float, colour: str) -> None:
