@@ -109,6 +109,20 @@ def test_without_a_common_clock_both_directions_are_told_together(tmp_path):
     assert NO_CLOCK in budget.notes
 
 
+def test_stamps_out_of_order_by_less_than_a_step_are_put_in_order(tmp_path):
+    """World lags behind its busy machine, so telemetry seems to arrive before it is sent."""
+    world, cloud = records("link.profile=ideal")
+    early = [each._replace(stamp_ns=each.stamp_ns - 9 * MS // 10) for each in cloud]
+    both = sorted([*world, *early], key=lambda each: each.stamp_ns)
+    flight = read_flight(write(tmp_path / "mission.mcap", both, "world"))
+    budget, applied = budget_of(flight), flight.during("/command_applied")
+    lengths = np.diff(budget.followed, axis=0)
+    assert lengths.min() >= 0
+    assert (lengths.sum(axis=0) == applied["stamp_ns"] - applied["basis_stamp_ns"]).all()
+    assert [each.name for each in budget.stages][1:4] == ["uplink", "queue", "downlink"]
+    assert budget.notes == ()
+
+
 def test_of_one_end_there_are_round_trips_alone(tmp_path):
     world, cloud = records(*CONSTANT)
     path = write(tmp_path / "world.mcap", world, "world")
