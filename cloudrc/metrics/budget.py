@@ -9,7 +9,6 @@ nanoseconds. A stage whose end no message tells becomes a part of the next one.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
@@ -212,7 +211,7 @@ class Budget(NamedTuple):
         if not ns.size:
             return None
         lengths = zip(self.stages, np.diff(ns, axis=0), strict=True)
-        counts = Counter(self.ended.tolist())
+        counts = {end: int((self.ended == end).sum()) for end in ENDS}
         return {
             "stages": {
                 stage.name: {"text": stage.text, **summary(length_ns)}
@@ -221,7 +220,7 @@ class Budget(NamedTuple):
             "age": summary(ns[-1] - ns[0]),
             "time_average": self.average,
             "commands": ns.shape[1],
-            "ended": {end: counts[end] for end in ENDS if counts[end]},
+            "ended": {end: count for end, count in counts.items() if count},
             "notes": [*self.notes],
             **({"scans": self.scans.document} if self.scans else {}),
         }
