@@ -8,6 +8,7 @@ quarter of the time of a numpy slice assignment.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cloudrc.geometry.scene import FLOOR
 from cloudrc.messages import ZERO, Odometry, Quaternion, Vector
 from cloudrc.outside.values import RESULT
 from cloudrc.records import Contact, SensorLabel
@@ -33,6 +35,8 @@ TOUCH_GAP = 0.1
 CONTACT_CHECK_STEPS = 5
 """Number of steps between two checks of the contacts while the number of contacts is constant. A
 check takes as long as a step."""
+NEVER_TOUCHED = -(1 << 62)
+"""Number of the step of a contact that has never been."""
 
 _mj_step = mujoco.mj_step
 _BAD = [
@@ -73,6 +77,11 @@ class Simulator:
         force_peak: Largest force on the probe since the last call of `take_contact_force` [N].
         impulse: Integral over time of the force on the probe since that call [N s].
         touches: Contacts that began since the last call of `take_contacts`.
+        bodies: For each geom, the number of its body; 0 for the robot's.
+        touched: Step of the last contact of each body, without the probe and with it, in turn.
+        gap_steps: Shortest number of steps without contact before a contact counts as new.
+        probe: Number of the probe's site; below 0 without one.
+        probe_radius: Radius of the probe [m].
         actuators: Physics of the robot's actuators.
         meter: Energy of the robot's rotors; None if it is not known.
         tape: Inputs of every step since the last reset, for `replay`; None unless a caller sets
@@ -115,18 +124,30 @@ class Simulator:
         self.sensors = tuple(sensors)
         addresses = [each.address for each in sensors]
         self._read_sensors = sensor_reader(self._sensordata, addresses)
-        self._probe = -1 if probe is None else find_part(model, "site", probe, "probe")
-        self.force_address = _find_force(model, self._probe)
-        of_force = (each for each in sensors if each.address == self.force_address)
+        self._find_probe(probe)
+        self._note_bodies()
+        self.reset()
+
+    def _find_probe(self, probe: str | None) -> None:
+        """Find the site with which the robot touches, and its sensor of force."""
+        model = self.model
+        self.probe = -1 if probe is None else find_part(model, "site", probe, "probe")
+        self.force_address = _find_force(model, self.probe)
+        of_force = (each for each in self.sensors if each.address == self.force_address)
         self.force_sensor = next((SensorLabel(each.name, each.unit) for each in of_force), None)
         self._probe_offset: Vector = ZERO
-        self._probe_radius = -1.0
-        if self._probe >= 0:
-            self._probe_offset = tuple(model.site_pos[self._probe].tolist())
-            self._probe_radius = float(model.site_size[self._probe, 0])
-        self._bodies = bodies_of_geoms(model)
-        self._gap_steps = round(TOUCH_GAP / self.dt)
-        self.reset()
+        self.probe_radius = -1.0
+        if self.probe >= 0:
+            self._probe_offset = tuple(model.site_pos[self.probe].tolist())
+            self.probe_radius = float(model.site_size[self.probe, 0])
+
+    def _note_bodies(self) -> None:
+        """Number the bodies that the robot can touch."""
+        names = bodies_of_geoms(self.model)
+        self._names = [*dict.fromkeys(["", FLOOR, *names])]
+        self.bodies = array("q", map(self._names.index, names))
+        self.touched = array("q", [0, 0] * len(self._names))
+        self.gap_steps = round(TOUCH_GAP / self.dt)
 
     def reset(self) -> None:
         """Reset the robot to its spawn, at rest, with still actuators."""
@@ -137,8 +158,10 @@ class Simulator:
         if self.tape is not None:
             self.tape.clear()
         self.touches: list[Contact] = []
+        for number in range(len(self.touched)):
+            self.touched[number] = NEVER_TOUCHED
         # The robot stands on the floor: only after a flight is the next contact a new contact.
-        self._last_touch: dict[tuple[str, bool], int] = {("floor", self._probe < 0): 0}
+        self.touched[2 * self._names.index(FLOOR) + (self.probe < 0)] = 0
         self._readings: Readings | None = None
         self.actuators.reset()
 
@@ -206,7 +229,7 @@ class Simulator:
     @property
     def touch_age(self) -> float:
         """Time since the robot's last contact, or since the last reset [s]."""
-        return (self.steps - max(self._last_touch.values())) * self.dt
+        return (self.steps - max(self.touched)) * self.dt
 
     def read_sensors(self) -> tuple[float, ...]:
         """Return what the robot's own sensors show, each in its unit, in the order of `sensors`."""
@@ -267,21 +290,21 @@ class Simulator:
 
     def _note_contacts(self, before: Readings) -> None:
         """Store the new contacts, with the robot's motion `before` the step of the simulation."""
-        contact = self.data.contact
-        probe = self.data.site_xpos[self._probe].tolist() if self._probe >= 0 else ZERO
+        contact, bodies = self.data.contact, self.bodies
+        probe = self.data.site_xpos[self.probe].tolist() if self.probe >= 0 else ZERO
         pairs, places = contact.geom.tolist(), contact.pos.tolist()
         for (first, second), place, is_near in zip(
             pairs, places, contact.exclude.tolist(), strict=True
         ):
             if is_near:  # not nearer than the `gap` of a geom
                 continue
-            body = self._bodies[first] or self._bodies[second]
-            by_probe = self._probe < 0 or dist(place, probe) <= self._probe_radius
-            last = self._last_touch.get((body, by_probe))
-            if last is None or self.steps - last > self._gap_steps:
+            body = bodies[first] or bodies[second]
+            by_probe = self.probe < 0 or dist(place, probe) <= self.probe_radius
+            number = 2 * body + by_probe
+            if self.steps - self.touched[number] > self.gap_steps:
                 motion = before.position, before.velocity, _velocity_at(before, self._probe_offset)
-                self.touches.append(Contact(0, body, *motion, by_probe))
-            self._last_touch[body, by_probe] = self.steps
+                self.touches.append(Contact(0, self._names[body], *motion, by_probe))
+            self.touched[number] = self.steps
 
 
 def _find_force(model: Any, site: int) -> int | None:

@@ -13,12 +13,33 @@ typedef struct { /* onboard/_twins.py has the same fields in the same order */
   double lead;                     /* memory, which Python reads and writes between two runs */
 } DiffDrive;
 
+static const double ROUNDING = 1e-9; /* [1]: larger than any relative rounding error */
+
+/* Return the speed, with its last bit right where this bit matters: only near rest, and where the
+   front is about to become the rear. There it takes a call of Python. */
+static double speed_of(const StepState *f, const DiffDrive *c, double ahead, double left) {
+  double speed = sqrt(ahead * ahead + left * left), room = ROUNDING * speed;
+  double above_end = c->lead * ahead + c->keep_end * speed;
+  if (speed - room > c->slow && (above_end > room || above_end < -room)) return speed;
+  return f->hypot(ahead, left);
+}
+
+/* Stop the wheels of a robot that is switched off. */
+static void stop(StepState *f, const DiffDrive *c) {
+  for (i64 i = 0; i < c->count; i++) f->ctrl[i] = f->speeds[i] = f->stopped[i];
+  for (int i = 0; i < 6; i++) f->applied[i] = 0.0;
+}
+
 int cloudrc_diff_drive(StepState *f, const Readings *r) {
   DiffDrive *c = f->controller;
+  if (f->is_off) {
+    stop(f, c);
+    return 1;
+  }
   double x = f->reference[0], y = f->reference[1];
   double ahead_x = r->axes[0], ahead_y = r->axes[1];
   double ahead = x * ahead_x + y * ahead_y, left = y * ahead_x - x * ahead_y;
-  double speed = f->hypot(ahead, left);
+  double speed = speed_of(f, c, ahead, left);
   if (c->lead * ahead < -c->keep_end * speed) c->lead = -c->lead;
   double share = speed / c->slow;
   if (1.0 < share) share = 1.0;

@@ -89,7 +89,7 @@ static void turn_rotors(StepState *f, const LowLevel *c, const Readings *r,
 int cloudrc_low_level(StepState *f, const Readings *r) {
   LowLevel *c = f->controller;
   double commands[4];
-  update(c, f->reference, r, commands);
-  turn_rotors(f, c, r, commands);
+  if (!f->is_off) update(c, f->reference, r, commands);
+  turn_rotors(f, c, r, f->is_off ? f->stopped : commands);
   return 1;
 }

@@ -162,17 +162,24 @@ static void drag(StepState *f, const Multirotor *c, const Readings *r) {
   }
 }
 
-int cloudrc_multirotor(StepState *f, const Readings *r) {
-  Multirotor *c = f->controller;
+static int update(const StepState *f, Multirotor *c, const Readings *r, double *commands) {
   Memory next = c->memory;
-  double velocity[3], acceleration[3], wanted[4], commands[ACTUATORS_MAX];
+  double velocity[3], acceleration[3], wanted[4];
   velocity_of(c, r, velocity);
   push(f, c, &next, velocity, acceleration);
   if (!turn(f, c, &next, r, &wanted[3])) return 0;
   tilt(f, c, r, acceleration, wanted);
   if (!allocate(c, wanted, commands)) return 0;
   c->memory = next;
-  for (i64 i = 0; i < c->count; i++) f->ctrl[i] = f->speeds[i] = commands[i];
+  return 1;
+}
+
+int cloudrc_multirotor(StepState *f, const Readings *r) {
+  Multirotor *c = f->controller;
+  double commands[ACTUATORS_MAX];
+  if (!f->is_off && !update(f, c, r, commands)) return 0;
+  for (i64 i = 0; i < c->count; i++)
+    f->ctrl[i] = f->speeds[i] = f->is_off ? f->stopped[i] : commands[i];
   if (c->drags)
     drag(f, c, r);
   else

@@ -2,9 +2,9 @@
 
 """A robot that runs its usual steps in C, and all others in Python, with the same results.
 
-In a usual step the robot follows a fresh command that the guard need not limit. Python and `step.c`
-share the structure `StepState`: constants, MuJoCo's addresses, present state. The onboard
-controller has a structure of its own, which its `Twin` makes.
+In a usual step the robot follows a fresh command that the guard need not limit, or stands on the
+ground, switched off. Python and `step.c` share the structure `StepState`: constants, MuJoCo's
+addresses, present state. The onboard controller has a structure of its own, which its `Twin` makes.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ import numpy as np
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import find_robot
 from cloudrc.config.shipped import file_of
+from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import load_scene
-from cloudrc.messages import Command
+from cloudrc.messages import NEVER_NS, ZERO, Command, GuardState, Vector
 from cloudrc.robots.native.library import Library, library
 from cloudrc.sim.memory import boxes_around, contacts_offset, mujoco_library, without_contacts
 from cloudrc.sim.onboard import Accelerator, Actuators, Onboard
@@ -37,31 +38,54 @@ from cloudrc.world.guard import state
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.robot import STEP, STEP_NS, Robot
 
+GROUND = GuardState.GROUND  # looking up a member of an enum is slow
 ACTUATORS_MAX = 16
 """Largest number of actuators that the structures of C hold."""
 _POINTERS = (
     *("mj_step", "model", "free_model", "data", "qpos", "qvel", "ctrl", "applied"),
-    *("probe_force", "contacts", "timer", "obstacles", "control", "controller"),
+    *("probe_force", "contacts", "contact_geoms", "contact_place", "contact_excluded"),
+    *("bodies", "touched", "probe", "timer", "obstacles", "control", "controller"),
 )
 _function = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double, ctypes.c_double)
-_HYPOT, _ATAN2 = _function(math.hypot), _function(math.atan2)
+_HYPOT = _function(math.hypot)
 Build: TypeAlias = Callable[[Any], tuple[Onboard, Actuators]]
 """Makes onboard controller and actuators for a compiled `MjModel`."""
 _double, _int64 = ctypes.c_double, ctypes.c_int64
-_VALUES = ("overturned_cosine", "sink_lead_max", "fence_reaction", "reaction", "stop_coefficient")
+_VALUES = (
+    *("overturned_cosine", "sink_lead_max", "fence_reaction", "reaction"),
+    *("far", "return_gain", "return_speed_max", "low_speed", "stop_coefficient"),
+)
 _FIELDS: dict[str, Any] = {
     **dict.fromkeys(_POINTERS, ctypes.c_void_p),
     **dict.fromkeys(("hypot", "atan2"), _function),
     **dict.fromkeys(_VALUES, _double),
     **{"change_max": _double, "low": _double * 3, "high": _double * 3},
-    **dict.fromkeys(("time_step", "robot_radius", "acceleration_max"), _double),
-    **dict.fromkeys(("step_ns", "check_steps", "obstacle_count"), _int64),
+    **dict.fromkeys(("low_height", "lift_off"), _double),
+    **dict.fromkeys(("time_step", "robot_radius", "acceleration_max", "probe_radius"), _double),
+    **dict.fromkeys(("step_ns", "check_steps", "obstacle_count", "gap_steps"), _int64),
+    **{"contact_size": _int64, "stopped": _double * ACTUATORS_MAX},
+    **{"is_off": _int64, "is_over": _int64, "ground": _double},
     **{"now_ns": _int64, "until_ns": _int64},
-    **{"reference": _double * 3, "wanted": _double * 3, "yaw_rate": _double},
-    **{"track_until_ns": _int64, "force_peak": _double, "impulse": _double},
+    **{"track_until_ns": _int64, "wanted": _double * 3, "yaw_rate": _double},
+    **{"force_peak": _double, "impulse": _double, "reference": _double * 3},
     **dict.fromkeys(("touching", "steps", "is_news", "free_steps"), _int64),
     **{"speeds": _double * ACTUATORS_MAX, "before": _double * 13},
 }
+
+
+@cache
+def _atan2() -> Any:
+    """Return what C calls as Python's `math.atan2`: the C library's, if both give the same bits.
+
+    This call takes a tenth of the time of a call of Python.
+    """
+    try:
+        found = _function(ctypes.cast(ctypes.CDLL(None).atan2, ctypes.c_void_p).value or 0)
+    except (OSError, AttributeError):
+        return _function(math.atan2)
+    tries = [(math.sin(k), math.cos(k * k)) for k in range(200)]
+    same = all(found(*each) == math.atan2(*each) for each in tries)
+    return found if same else _function(math.atan2)
 
 
 class StepState(ctypes.Structure):
@@ -111,29 +135,37 @@ def make_state(simulator: Simulator, guard: Guard, twin: Twin) -> StepState:
     obstacles, radius = boxes_around(model, data)
     if twin.acceleration_max == math.inf:
         radius = math.inf
+    probe = data.site_xpos[simulator.probe].ctypes.data if simulator.probe >= 0 else None
+    low_height = guard.box[0][2] - FLOOR_MARGIN + rules.LOW_HEIGHT
     mujoco = mujoco_library()
     flight = StepState(
         ctypes.cast(mujoco.mj_step, ctypes.c_void_p),
         # MuJoCo has no public name for the addresses.
         *(model._address, free_model._address, data._address),
         *(array.ctypes.data for array in arrays),
-        data._address + contacts_offset(),
+        *(data._address + contacts_offset(), None, None, None),
+        *(simulator.bodies.buffer_info()[0], simulator.touched.buffer_info()[0], probe),
         ctypes.addressof(ctypes.c_void_p.in_dll(mujoco, "mjcb_time")),
         obstacles.ctypes.data,
-        *(library().controls[twin.control], ctypes.addressof(twin.block), _HYPOT, _ATAN2),
+        *(library().controls[twin.control], ctypes.addressof(twin.block), _HYPOT, _atan2()),
         *(state.OVERTURNED_COSINE, rules.SINK_LEAD_MAX, rules.FENCE_REACTION, rules.REACTION),
+        *(rules.FAR, rules.RETURN_GAIN, rules.RETURN_SPEED_MAX, rules.LOW_SPEED),
         *(guard.stop_coefficient, guard.acceleration_max * STEP, *guard.box),
-        *(simulator.dt, radius, twin.acceleration_max, STEP_NS),
-        *(CONTACT_CHECK_STEPS, len(obstacles)),
+        *(low_height, guard.take_off.lift_off),
+        *(simulator.dt, radius, twin.acceleration_max, simulator.probe_radius, STEP_NS),
+        *(CONTACT_CHECK_STEPS, len(obstacles), simulator.gap_steps),
     )
     flight.keep = obstacles, free_model, force, twin  # else Python frees their memory
     return flight
 
 
 _TRACK = StepState.now_ns.offset  # times, too: an argument costs more than a field of this block
-_MEMORY = StepState.free_steps.offset
+_FOUND = StepState.force_peak.offset
+_REFERENCE = StepState.reference.offset
+_OFF = StepState.is_off.offset
 _BEFORE = StepState.before.offset
-_pack_track, _unpack_before = Struct("2q7dq2d2q").pack_into, Struct("13d").unpack_from
+_pack_track, _unpack_before = Struct("3q6d").pack_into, Struct("13d").unpack_from
+_pack_off = Struct("2qd").pack_into
 
 
 def accelerate(twin: type[Twin], robot: str, build: Build) -> Accelerator:
@@ -166,8 +198,9 @@ def _make(twin: type[Twin], simulator: Simulator, onboard: Onboard, guard: Guard
 class NativeRobot(Robot):
     """A `Robot` that simulates usual steps in C (`step.c`) and all others in Python.
 
-    In a usual step the robot follows a fresh command that the guard need not limit. No step runs in
-    C while the robot has observers, or while `Simulator.tape` records the controls of each step.
+    In a usual step the robot follows a fresh command that the guard need not limit, or stands on
+    the ground, switched off. No step runs in C while the robot has observers, or while
+    `Simulator.tape` records the controls of each step.
     """
 
     def __init__(
@@ -176,13 +209,14 @@ class NativeRobot(Robot):
         super().__init__(simulator, onboard, guard)
         self._twin = twin(simulator, onboard)
         self._flight = make_state(simulator, guard, self._twin)
+        self._flight.stopped[: len(onboard.stopped)] = onboard.stopped
         self._address = ctypes.addressof(self._flight)
         run = library().run
         assert run is not None
         self._run_steps = run
         speeds = f"{simulator.model.nu}d"
-        self._pack_memory = Struct(f"q{speeds}").pack_into
-        self._unpack_track = Struct(f"16x3d40x2d3q8x{speeds}").unpack_from
+        self._pack_state = Struct(f"3d4q{speeds}").pack_into
+        self._unpack_found = Struct(f"5d3q8x{speeds}").unpack_from
         self._in_c = False  # whether C has the newest state of the controller
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
@@ -193,41 +227,25 @@ class NativeRobot(Robot):
     def run(self, tick_ns: int, until_ns: int) -> int:
         """Run steps from `tick_ns` up to `until_ns`; return the time of the next step [ns].
 
-        C runs the steps while the robot follows a fresh command that the guard need not limit.
-        Python runs the first other step, and all steps after it.
+        C runs the steps while the robot is switched off, and while it follows a fresh command that
+        the guard need not limit. Python runs the first other step, and all steps after it.
         """
-        simulator, guard, twin = self.simulator, self.guard, self._twin
-        in_c = not self.observers and simulator.tape is None
+        guard, twin, take_off = self.guard, self._twin, self.guard.take_off
+        in_c = not self.observers and self.simulator.tape is None
+        if in_c and guard.state is GROUND:
+            tick_ns = self._stand(tick_ns, until_ns)
         while in_c and (track := guard.plain_track(tick_ns)):
-            next_ns, reference, wanted, track_ns = track
-            stop_ns = next_ns if next_ns < until_ns else until_ns
-            force = simulator.force_peak, simulator.impulse
-            counts = simulator.contacts, simulator.steps
-            # fmt: off
-            _pack_track(
-                self._flight, _TRACK, tick_ns, stop_ns, *reference, *wanted, guard.yaw_rate,
-                track_ns, *force, *counts,
-            )
-            # fmt: on
+            next_ns, wanted, track_ns = track
             if not self._in_c:
                 if not twin.give():
                     break
-                self._pack_memory(self._flight, _MEMORY, 0, *simulator.actuators.speeds)
-            while steps := self._run_steps(self._address):
-                tick_ns += steps * STEP_NS
-                self._in_c = True
-                # fmt: off
-                (
-                    x, y, z, peak, impulse, contacts, total, news, *speeds,
-                ) = self._unpack_track(self._flight, _TRACK)
-                # fmt: on
-                guard.reference, before = (x, y, z), None
-                if news:
-                    numbers = _unpack_before(self._flight, _BEFORE)
-                    before = Readings.of(numbers[:7], numbers[7:])
-                simulator.take_over(tuple(speeds), peak, impulse, contacts, total, before)
-                if tick_ns >= stop_ns:
-                    break
+                self._give_state()
+            if is_taking_off := not take_off.over:
+                self._give_take_off(is_off=False)
+            stop_ns = next_ns if next_ns < until_ns else until_ns
+            tick_ns = self._run_in_c(tick_ns, stop_ns, wanted, track_ns)
+            if is_taking_off:
+                take_off.rise(is_over=bool(self._flight.is_over))
             if tick_ns >= until_ns:
                 return tick_ns
             in_c = tick_ns >= stop_ns  # else C has left a step to Python
@@ -235,6 +253,69 @@ class NativeRobot(Robot):
             twin.take()
             self._in_c = False
         return super().run(tick_ns, until_ns)
+
+    def _run_in_c(self, tick_ns: int, stop_ns: int, wanted: Vector, track_ns: int) -> int:
+        """Run steps in C up to `stop_ns`, or to the first that Python has to do; return its time.
+
+        `wanted` is the commanded velocity [m/s]. The robot may follow it up to `track_ns` [ns].
+        """
+        simulator, guard, (x, y, z) = self.simulator, self.guard, wanted
+        # fmt: off
+        _pack_track(
+            self._flight, _TRACK, tick_ns, stop_ns, track_ns, x, y, z, guard.yaw_rate,
+            simulator.force_peak, simulator.impulse,
+        )
+        # fmt: on
+        while steps := self._run_steps(self._address):
+            tick_ns += steps * STEP_NS
+            self._in_c = True
+            # fmt: off
+            (
+                peak, impulse, x, y, z, contacts, total, news, *speeds,
+            ) = self._unpack_found(self._flight, _FOUND)
+            # fmt: on
+            guard.reference, before = (x, y, z), None
+            if news:
+                numbers = _unpack_before(self._flight, _BEFORE)
+                before = Readings.of(numbers[:7], numbers[7:])
+            simulator.take_over(tuple(speeds), peak, impulse, contacts, total, before)
+            if news and not self._flight.contact_geoms:
+                self._show_contacts()
+            if tick_ns >= stop_ns:
+                break
+        return tick_ns
+
+    def _stand(self, tick_ns: int, until_ns: int) -> int:
+        """Run steps of a robot that is switched off in C; return the time of the next step [ns]."""
+        guard = self.guard
+        stop_ns = guard.stands_until(tick_ns, until_ns)
+        if stop_ns <= tick_ns:
+            return tick_ns
+        self.onboard.reset()
+        self._give_state()
+        self._give_take_off(is_off=True)
+        tick_ns = self._run_in_c(tick_ns, stop_ns, ZERO, NEVER_NS)
+        self._in_c, self._flight.is_off = False, False
+        guard.take_off.stand(self._flight.before[2])
+        return tick_ns
+
+    def _give_state(self) -> None:
+        """Tell C what Python's own steps have changed."""
+        simulator = self.simulator
+        state = *self.guard.reference, simulator.contacts, simulator.steps, 0, 0
+        self._pack_state(self._flight, _REFERENCE, *state, *simulator.actuators.speeds)
+
+    def _give_take_off(self, *, is_off: bool) -> None:
+        _pack_off(self._flight, _OFF, is_off, False, self.guard.take_off.height)
+
+    def _show_contacts(self) -> None:
+        """Tell C where MuJoCo keeps the contacts; the place stays, but only a contact shows it."""
+        flight, contact = self._flight, self.simulator.data.contact
+        if len(contact.exclude):
+            flight.contact_geoms = contact.geom.ctypes.data
+            flight.contact_place = contact.pos.ctypes.data
+            flight.contact_excluded = contact.exclude.ctypes.data
+            flight.contact_size = contact.geom.strides[0]
 
 
 @cache
@@ -264,10 +345,11 @@ def _parts(robot: str, build: Build) -> tuple[Simulator, Onboard, Guard]:
 def _fly(robot: Robot) -> list[object]:
     """Fly the self-test: 0.8 s with take-off and curves; return the states on the way."""
     robot.put_on_ground(0, "self-test")
-    robot.guard.start_mission(0)
     flies, seen = robot.guard.fence.ground is None, list[object]()
     for now_ns in range(0, 800_000_000, 5 * STEP_NS):
         share = now_ns * 1e-9
+        if now_ns == 20_000_000:
+            robot.guard.start_mission(now_ns)
         climb = (3.0 if share < 0.5 else -0.1) if flies else 0.0
         velocity = (2.0 * share, 1.0 - share, climb)
         robot.guard.accept_command(Command(0, now_ns, 0, velocity, 0.0), now_ns)

@@ -2,21 +2,26 @@
  * SPDX-License-Identifier: Apache-2.0
  */
 
-/* Fly the robot in the usual case: a fresh command that the guard need not limit.
+/* Fly the robot in the usual cases: a fresh command that the guard need not limit, and a robot that
+   stands on the ground, switched off.
 
    This file is the twin of Python code, and gives the same bits. The Python code is the reference:
    it has the sources of all formulas and numbers, and it flies the robot in every other case.
 
      read          readings.Readings.of
      guard_step    guard.state.Guard.step, for a robot in TRACK with a fresh command
-     is_far        guard.limits.limit_to_fence, where it changes nothing
+     has_left      guard.hold.TakeOff.look, for a robot that is switched on
+     is_inside     guard.limits.limit_to_fence, where it changes nothing
      control       the robot's own: low_level.c, multirotor.c, diff_drive.c
      feel          simulator.Simulator._feel
+     go_on         simulator.Simulator._note_contacts, for contacts that are not new
 
    Where nothing can touch the robot, `step_physics` lets MuJoCo look for no contacts. */
 
 #include "step.h"
 
+static const double FASTEST = 1e300; /* [m/s]: no velocity is larger */
+static const double UNSURE = 1e-9; /* [m^2]: larger than a rounding error of a squared distance */
 static const double ROOM = 1e-6; /* [m]: no rounding error matters, the fence limits nothing */
 
 static void read(const StepState *f, Readings *r) {
@@ -47,6 +52,41 @@ static int is_far(const StepState *f, const double *velocity, const double *posi
   return 1;
 }
 
+/* Return the largest velocity towards a face of the fence. */
+static double approach_speed(const StepState *f, double distance, double reaction) {
+  if (distance > f->far) return FASTEST;
+  if (distance > 0.0) {
+    double root = sqrt(reaction * reaction + 4.0 * f->stop_coefficient * distance);
+    return 2.0 * distance / (reaction + root);
+  }
+  double back = f->return_gain * distance, most = -f->return_speed_max;
+  return distance < 0.0 ? (most > back ? most : back) : 0.0;
+}
+
+/* Tell whether the fence does not limit the velocity, also where a face is near. */
+static int is_inside(const StepState *f, const double *velocity, const double *position) {
+  if (is_far(f, velocity, position)) return 1;
+  double x = velocity[0], y = velocity[1], most = f->low_speed;
+  if (!(position[2] >= f->low_height)) {
+    if (x > most || -x > most || y > most || -y > most) return 0;
+    if (x * x + y * y > most * most) return 0;
+  }
+  for (int i = 0; i < 3; i++) {
+    double reaction = i == 2 ? f->reaction : f->fence_reaction; /* towards the lower face */
+    double least = -approach_speed(f, position[i] - f->low[i], reaction);
+    double largest = approach_speed(f, f->high[i] - position[i], f->fence_reaction);
+    if (i == 2 && least > 0.0) least = 0.0;
+    if (!(least <= velocity[i] && velocity[i] <= largest)) return 0;
+  }
+  return 1;
+}
+
+/* Tell whether the robot has left the ground. */
+static int has_left(const StepState *f, const Readings *r) {
+  double rise = r->pose[2] - f->ground;
+  return f->is_over || !((rise < 0.0 ? -rise : rise) < f->lift_off);
+}
+
 /* Move the reference by one step; return 0, with nothing changed, if Python has to do this step. */
 static int guard_step(StepState *f, const Readings *r, i64 now_ns) {
   if (r->axes[8] < f->overturned_cosine || now_ns > f->track_until_ns) return 0;
@@ -58,8 +98,42 @@ static int guard_step(StepState *f, const Readings *r, i64 now_ns) {
   double moved[3] = {from[0] + share * x, from[1] + share * y, from[2] + share * z};
   const double *reference = settles ? to : moved;
   if (reference[2] < r->twist[2] - f->sink_lead_max) return 0;
-  if (!is_far(f, reference, r->pose)) return 0;
+  if (!is_inside(f, reference, r->pose)) return 0;
+  f->is_over = has_left(f, r);
   for (int i = 0; i < 3; i++) f->reference[i] = reference[i];
+  return 1;
+}
+
+/* Tell which part touches at a place: 1 the probe, 0 another part, -1 it may be both. */
+static int touching_part(const StepState *f, const double *place) {
+  if (!f->probe) return 1;
+  double square = 0.0;
+  for (int i = 0; i < 3; i++)
+    square += (place[i] - f->probe[i]) * (place[i] - f->probe[i]);
+  double beyond = square - f->probe_radius * f->probe_radius;
+  return beyond < -UNSURE ? 1 : beyond > UNSURE ? 0 : -1;
+}
+
+/* Return where the step of the last contact like this one is noted; 0 if only Python knows. */
+static i64 *last_touch(const StepState *f, i64 shift) {
+  const int *geoms = (const int *)(f->contact_geoms + shift);
+  if (geoms[0] < 0 || geoms[1] < 0) return 0;
+  i64 body = f->bodies[geoms[0]] ? f->bodies[geoms[0]] : f->bodies[geoms[1]];
+  int part = touching_part(f, (const double *)(f->contact_place + shift));
+  return part < 0 ? 0 : f->touched + 2 * body + part;
+}
+
+/* Note all contacts if none of them is new; otherwise return 0, with nothing changed. */
+static int go_on(const StepState *f) {
+  i64 end = *f->contacts * f->contact_size;
+  if (!f->contact_geoms) return 0;
+  for (int notes = 0; notes <= 1; notes++)
+    for (i64 shift = 0; shift < end; shift += f->contact_size) {
+      if (*(const int *)(f->contact_excluded + shift)) continue;
+      i64 *last = last_touch(f, shift);
+      if (!last || f->steps - *last > f->gap_steps) return 0;
+      if (notes) *last = f->steps;
+    }
   return 1;
 }
 
@@ -71,7 +145,7 @@ static void feel(StepState *f) {
   double force = *f->probe_force;
   f->impulse += force * f->time_step;
   if (force > f->force_peak) f->force_peak = force;
-  f->is_news = contacts && (contacts != before || f->steps % f->check_steps == 0);
+  f->is_news = contacts && (contacts != before || f->steps % f->check_steps == 0) && !go_on(f);
   f->touching = contacts;
 }
 
@@ -121,9 +195,10 @@ i64 cloudrc_run(StepState *f) {
     Readings r;
     read(f, &r);
     double x = f->reference[0], y = f->reference[1], z = f->reference[2];
-    if (!guard_step(f, &r, f->now_ns)) break;
+    i64 was_over = f->is_over;
+    if (!f->is_off && !guard_step(f, &r, f->now_ns)) break;
     if (!f->control(f, &r)) {
-      f->reference[0] = x, f->reference[1] = y, f->reference[2] = z;
+      f->reference[0] = x, f->reference[1] = y, f->reference[2] = z, f->is_over = was_over;
       break;
     }
     for (int i = 0; i < 7; i++) f->before[i] = r.pose[i];

@@ -209,23 +209,33 @@ class TakeOff:
     the robot may take off again, it has to come to rest on the ground, at least TAKE_OFF_MARGIN
     inside the fence. A planar robot takes off, as it were, when it is allowed to move; it needs no
     margin.
+
+    Attributes:
+        over: Whether the robot has left the ground.
+        height: Height at which the robot stood when it was off [m]; NaN before.
+        lift_off: Change of the height with which it has left the ground [m].
     """
 
     def __init__(self, fence: Fence) -> None:
         """Set the fence; begin before the take-off."""
         (ax, ay, az), (bx, by, bz) = fence.low, fence.high
-        margin, self._lift_off = TAKE_OFF_MARGIN, LIFT_OFF_HEIGHT
+        margin, self.lift_off = TAKE_OFF_MARGIN, LIFT_OFF_HEIGHT
         if fence.ground is not None:
-            margin, self._lift_off, az, bz = 0.0, 0.0, -inf, inf
+            margin, self.lift_off, az, bz = 0.0, 0.0, -inf, inf
         self._low = (ax + margin, ay + margin, az)
         self._high = (bx - margin, by - margin, bz)
         self.over = self._stopped = False
-        self._still_ticks, self._height = 0, nan
+        self._still_ticks, self.height = 0, nan
 
     @property
     def allowed(self) -> bool:
         """Whether the robot may leave the ground."""
         return not self._stopped or self._still_ticks >= STILL_TICKS
+
+    @property
+    def allowed_at_once(self) -> bool:
+        """Whether the robot may leave the ground without a rest before."""
+        return not self._stopped
 
     @property
     def condition(self) -> Cause:
@@ -243,7 +253,15 @@ class TakeOff:
         """
         self.over = False
         if stopped:
-            self._stopped, self._still_ticks, self._height = True, 0, nan
+            self._stopped, self._still_ticks, self.height = True, 0, nan
+
+    def stand(self, height: float) -> None:
+        """Take over what `look` finds if a robot that is off stands at `height` [m]."""
+        self.height = height
+
+    def rise(self, *, is_over: bool) -> None:
+        """Take over what `look` finds of a robot that is on; `is_over`: it has left the ground."""
+        self.over, self._stopped = is_over, False
 
     def look(self, readings: Readings, flies: bool) -> None:
         """Process the sensor readings of a physics step; `flies` tells whether it is on.
@@ -253,9 +271,9 @@ class TakeOff:
         """
         height = readings.position[2]
         if flies:
-            self.over, self._stopped = not abs(height - self._height) < self._lift_off, False
+            self.over, self._stopped = not abs(height - self.height) < self.lift_off, False
         else:
-            self._height = height
+            self.height = height
             if self._stopped:
                 at = readings.position
                 inside = all(map(le, self._low, at)) and all(map(le, at, self._high))

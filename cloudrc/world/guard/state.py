@@ -104,6 +104,7 @@ class Guard:
             [ns].
         acceleration_max: Largest rate of change of the velocity reference [m/s^2].
         stop_coefficient: Braking distance divided by the square of the speed [s^2/m].
+        take_off: What the guard knows of the take-off.
         changes: Changes of the state since the last `take_changes`.
         counts: Counters of world. The guard counts "limited_speed": shortened velocities of
             commands and plans; "limited_yaw_rate": commands with a limited yaw rate;
@@ -137,7 +138,7 @@ class Guard:
         self._floor, half = self._low[2], 0.5 * limits.speed_max_mps
         self._position_hold = PositionHold(self._low, self._high, half, self._braking)
         self._descent = Halt() if robot.stop == "brake" else Descent(self._floor, half)
-        self._take_off = TakeOff(fence)
+        self.take_off = TakeOff(fence)
         self.changes: list[GuardChange] = []
         self.counts: Counter[str] = Counter()
         self.state, self.cause = GROUND, Cause.SPAWN
@@ -215,7 +216,7 @@ class Guard:
     def acknowledge(self, now_ns: int) -> None:
         """Process the operator's acknowledgement of LAND or ESTOP; nothing starts."""
         if self.latched and not self._flies:
-            self._enter(GROUND, now_ns, self._take_off.condition)
+            self._enter(GROUND, now_ns, self.take_off.condition)
         elif self.state is LAND:
             self._descent.acknowledged = True
 
@@ -315,7 +316,7 @@ class Guard:
         present command becomes too old, and the next HOLD may begin.
         """
         apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
-        return self._take_off.allowed and apart_ns >= SETTLE_NS
+        return self.take_off.allowed and apart_ns >= SETTLE_NS
 
     def _note_invalid(self, now_ns: int) -> None:
         self._invalid_ns.append(now_ns)
@@ -336,8 +337,8 @@ class Guard:
             self._play(self._played, now_ns)
         if self._flies and readings.axes[8] < OVERTURNED_COSINE:
             self._enter(ESTOP, now_ns, Cause.OVERTURNED)
-        elif not self._take_off.over:
-            self._take_off.look(readings, self._flies)
+        elif not self.take_off.over:
+            self.take_off.look(readings, self._flies)
         if now_ns <= self._track_until_ns:
             change_max = self.acceleration_max * dt
             reference = step_towards(self.reference, self._wanted, change_max)
@@ -350,18 +351,31 @@ class Guard:
         self._follow(reference, now_ns, readings, dt)
         return self.reference
 
-    def plain_track(self, now_ns: int) -> tuple[int, Vector, Vector, int] | None:
+    def plain_track(self, now_ns: int) -> tuple[int, Vector, int] | None:
         """Return the values with which C (`step.c`) runs `step` from `now_ns` [ns] on.
 
-        The values are: start of the plan's next velocity [ns], velocity reference [m/s], commanded
-        velocity [m/s], and end of the time in which the robot may follow the command or plan [ns].
-        Return None in all cases that only `step` handles, such as HOLD and the take-off.
+        The values are: start of the plan's next velocity [ns], commanded velocity [m/s], and end of
+        the time in which the robot may follow the command or plan [ns].
+        Return None in all cases that only `step` handles, such as HOLD.
         """
-        if not (self._take_off.over and self._ramp_until_ns <= now_ns <= self._track_until_ns):
+        if not self._ramp_until_ns <= now_ns <= self._track_until_ns:
+            return None
+        if self._planar and not self.take_off.over:  # the next step ends its take-off
             return None
         if now_ns >= self._next_ns:
             self._play(self._played, now_ns)
-        return self._next_ns, self.reference, self._wanted, self._track_until_ns
+        return self._next_ns, self._wanted, self._track_until_ns
+
+    def stands_until(self, now_ns: int, until_ns: int) -> int:
+        """Return up to when C (`step.c`) runs `step` of a robot on the ground [ns].
+
+        This is at most `until_ns`; it is `now_ns` if only `step` handles the next step.
+        """
+        if self.state is not GROUND or not self.take_off.allowed_at_once:
+            return now_ns
+        if self.armed:
+            until_ns = min(until_ns, self._alone_ns + self._alone_max_ns + 1)
+        return min(until_ns, self._next_ns)
 
     def _follow(self, reference: Vector, now_ns: int, readings: Readings, dt: float) -> None:
         """Store a velocity reference, limited to keep the robot upright and inside the fence."""
@@ -400,8 +414,8 @@ class Guard:
                 state = GROUND if self._descent.acknowledged else LAND
                 self._enter(state, now_ns, Cause.DOWN)
                 self._flies, self.reference = False, ZERO
-                self._take_off.forget(stopped=True)  # the robot may slide off an obstacle
-        if self.state is HOLD and self._take_off.may_end(readings):
+                self.take_off.forget(stopped=True)  # the robot may slide off an obstacle
+        if self.state is HOLD and self.take_off.may_end(readings):
             self._enter(GROUND, now_ns, Cause.NOT_OFF)
 
     def _enter(self, state: GuardState, now_ns: int, cause: Cause, text: str = "") -> None:
@@ -422,5 +436,5 @@ class Guard:
             self._descent.begin(now_ns)
             if state is not LAND:
                 self.reference = ZERO
-                self._take_off.forget(stopped=state is ESTOP)
+                self.take_off.forget(stopped=state is ESTOP)
         self.changes.append(GuardChange(now_ns, state, text or cause.words))

@@ -203,6 +203,29 @@ def test_c_finds_the_contacts_with_a_body_that_mujoco_does_not_fuse(scene_with):
     assert touches[0].body == "pillar"
 
 
+def test_c_runs_the_steps_on_the_ground_and_of_the_take_off():
+    robots = both()
+    count, seen = Count(robots[1]), ([], [])
+    for robot, found in zip(robots, seen, strict=True):
+        for now_ns in range(0, SECOND, 10 * MS):
+            if now_ns == 200 * MS:
+                robot.guard.start_mission(now_ns)
+            robot.guard.accept_command(Command(0, now_ns, 0, (0.3, 0.0, 1.0), 0.0), now_ns)
+            robot.run(now_ns, now_ns + 10 * MS)
+            found += [robot.simulator.readings, robot.guard.reference, robot.simulator.touch_age]
+    assert seen[0] == seen[1]
+    assert count.steps == 500
+    assert robots[1].guard.take_off.over
+
+
+def test_python_looks_at_no_contact_that_goes_on(monkeypatch):
+    robot = NativeRobot(*rover_parts(), DiffDriveTwin)
+    looks = Mock(wraps=robot.simulator._note_contacts)
+    monkeypatch.setattr(robot.simulator, "_note_contacts", looks)
+    Pilot(robot).fly(2.0, lambda pilot: (0.5, 0.0, 0.0))
+    assert 0 < looks.call_count < 10
+
+
 def nearest(robot, position):
     """Return how far the ball around a robot at `position` is from every obstacle of `step.c`."""
     rows, *_ = robot._flight.keep

@@ -149,6 +149,16 @@ def test_a_take_off_is_over_at_the_lift_off_height(height, over):
     assert never_seen.over
 
 
+@pytest.mark.parametrize(("height", "over"), [(0.0, False), (1.0, True)])
+def test_what_others_saw_of_a_take_off_counts_as_what_it_saw_itself(height, over):
+    told, saw = TakeOff(FENCE), TakeOff(FENCE)
+    saw.look(sensed((0.0, 0.0, 0.0)), flies=False)
+    saw.look(sensed((0.0, 0.0, height)), flies=True)
+    told.stand(0.0)
+    told.rise(is_over=over)
+    assert vars(told) == vars(saw)
+
+
 @pytest.mark.parametrize("axis", range(3))
 def test_at_speed_the_rotors_do_not_stop(axis):
     for share, may in ((0.99, True), (1.0, False)):

@@ -2,6 +2,7 @@
 
 """How the guard is armed, limits commands, holds, lands, stops, and takes off."""
 
+from dataclasses import replace
 from math import cos, dist, inf, nan, nextafter, radians, sin
 
 import pytest
@@ -487,20 +488,47 @@ def test_after_flying_the_rotors_do_not_stop_where_it_stood():
 def test_c_may_run_the_steps_of_a_fresh_command_in_the_air():
     guard, half, wanted = taking_off(1.0), (0.0, 0.0, 0.5), (0.0, 0.0, 1.0)
     next_ns, *track = guard.plain_track(10 * MS)
-    assert track == [guard.reference, wanted, 250 * MS]
+    assert track == [wanted, 250 * MS]
     assert next_ns > 250 * MS, "there is no plan"
     assert guard.plain_track(252 * MS) is None
-    guard.reference = half
-    assert guard.plain_track(20 * MS)[1:] == (half, wanted, 250 * MS)
+    assert guard.plain_track(20 * MS)[1:] == (wanted, 250 * MS)
     planned = command(wanted, 30 * MS)._replace(plan=(half, ZERO), planned_ns=32 * MS)
     assert guard.accept_command(planned, 30 * MS) is None
     for now_ms, next_ms, velocity in ((40, 42, wanted), (42, 52, half)):
-        next_ns, _, asked, *_ = guard.plain_track(now_ms * MS)
+        next_ns, asked, _ = guard.plain_track(now_ms * MS)
         assert (next_ns, asked) == (next_ms * MS, velocity)
 
 
-def test_c_runs_no_step_before_take_off_or_after_a_hold():
-    assert taking_off(0.01).plain_track(10 * MS) is None
+def test_c_runs_no_step_of_a_planar_robot_before_take_off():
+    guard = Guard(LIMITS, replace(FENCE, ground=0.1))
+    guard.start_mission(0)
+    assert guard.accept_command(command((0.0, 1.0, 0.0), 0), 0) is None
+    assert states(guard) == [TRACK]
+    assert guard.plain_track(0) is None
+
+
+def test_c_runs_the_steps_of_a_robot_on_the_ground_until_it_lands_alone():
+    guard = Guard(LIMITS, FENCE)
+    assert guard.stands_until(0, 10 * MS) == 10 * MS
+    guard.start_mission(0)
+    alone_ns = round(LIMITS.hold_max_s * SECOND)
+    assert guard.stands_until(alone_ns, 2 * alone_ns) == alone_ns + 1
+    run(guard, alone_ns, alone_ns + 1, STANDS)
+    assert states(guard) == []
+    run(guard, alone_ns + 1, alone_ns + 2, STANDS)
+    assert states(guard) == [LAND]
+
+
+def test_c_runs_no_step_of_a_robot_that_has_to_come_to_rest_before_take_off():
+    guard = taking_off(1.0)
+    guard.stop(10 * MS)
+    assert guard.stands_until(10 * MS, 20 * MS) == 10 * MS
+    guard.acknowledge(10 * MS)
+    assert states(guard) == [ESTOP, GROUND]
+    assert guard.stands_until(10 * MS, 20 * MS) == 10 * MS
+
+
+def test_c_runs_no_step_after_a_hold():
     guard = taking_off(1.0)
     run(guard, 10 * MS, 2 * SECOND, (0.0, 0.0, 1.1))
     now_ns = feed(guard, 2 * SECOND, 20, (0.0, 0.0, 1.0), position=(0.0, 0.0, 1.1))
