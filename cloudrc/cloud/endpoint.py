@@ -177,13 +177,14 @@ class CloudEndpoint(TunnelEnd):
 
     def handle_deadline(self, now_ns: int) -> None:
         """Send the datagrams that are due at `now_ns` [ns]; skip missed periods."""
-        if now_ns < self.next_deadline_ns():
-            return
-        if self._unsent is not None:
-            self._send_computed(self._unsent[1], now_ns)
-        if now_ns < self._tick_ns:
-            self._answer_if_due(now_ns)
-            return
+        if self._unsent is not None or now_ns < self._tick_ns:
+            if now_ns < self.next_deadline_ns():
+                return
+            if self._unsent is not None:
+                self._send_computed(self._unsent[1], now_ns)
+            if now_ns < self._tick_ns:
+                self._answer_if_due(now_ns)
+                return
         missed = (now_ns - self._tick_ns) // self._period_ns
         if missed:
             self._note_missed(missed, now_ns)
@@ -382,9 +383,11 @@ class CloudEndpoint(TunnelEnd):
         if self._on_arrival:
             soonest_ns = max(now_ns, self._commanded_ns + self._period_ns // 2)
             self._due_ns = min(self._due_ns, soonest_ns)
-        if (followed := self._loop.plans.look_up(telemetry, now_ns)) is not None:
+        log = self._loop.plans
+        if log.plans and (followed := log.look_up(telemetry, now_ns)) is not None:
             self._records.append(followed)
-        self._asked = max(self._asked, telemetry.mission)
+        if telemetry.mission > self._asked:
+            self._asked = telemetry.mission
         # The last command was made before this telemetry: it has the delay of the one before.
         known, self._uplink_delay = (self._uplink_delay, self._control), delay
         self.teleop.see(make_robot_status(telemetry, epoch, self._world, *known), now_ns)

@@ -18,23 +18,27 @@ TRACK = GuardState.TRACK  # looking up a member of an enum is slow
 
 
 class PlanLog:
-    """The plans of a session's commands that the robot may still follow, oldest first."""
+    """The plans of a session's commands that the robot may still follow.
+
+    Attributes:
+        plans: The plans, oldest first. Stamp of the command [ns], cloud's clock -> beginning of its
+            plan [ns], world's clock, and the predicted positions [m]: one at the beginning, and one
+            after each PLAN_STEP_NS.
+    """
 
     def __init__(self) -> None:
-        # Stamp of the command [ns], cloud's clock -> beginning of its plan [ns], world's clock, and
-        # the predicted positions [m]: one at the beginning, and one after each PLAN_STEP_NS.
-        self._plans: dict[int, tuple[int, Sequence[Vector]]] = {}
+        self.plans: dict[int, tuple[int, Sequence[Vector]]] = {}
 
     def add(self, command: Command, positions: Sequence[Vector]) -> None:
         """Store the `positions` [m] that the plan of a command predicts."""
-        self._plans[command.stamp_ns] = command.planned_ns, positions
+        self.plans[command.stamp_ns] = command.planned_ns, positions
 
     def look_up(self, telemetry: Telemetry, now_ns: int) -> PlanFollowed | None:
         """Return what the plan in use predicted; telemetry arrived at `now_ns` [ns], cloud's clock.
 
         Return None if the robot follows no plan, or if its plan has ended.
         """
-        plans, echo_ns = self._plans, telemetry.echo_stamp_ns
+        plans, echo_ns = self.plans, telemetry.echo_stamp_ns
         while plans and (oldest := next(iter(plans))) < echo_ns:
             del plans[oldest]  # the robot follows a newer command
         if telemetry.guard is not TRACK or echo_ns not in plans:

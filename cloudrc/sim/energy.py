@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,22 +22,22 @@ class EnergyMeter:
     Source: J. G. Leishman, "Principles of Helicopter Aerodynamics", Cambridge University Press,
     2nd edition 2006, chapter 2 (power = torque times speed); R. Mahony, V. Kumar, P. Corke,
     "Multirotor aerial vehicles", IEEE Robotics & Automation Magazine 19 (3), 2012 (f = k w^2).
+
+    Attributes:
+        sample: Stores the present thrusts.
     """
 
     def __init__(self, data: Any, factors: Array) -> None:
         """Begin with 0 J; `data` is an `MjData`, `factors` [W/N^1.5] those of `power_factors`."""
-        self._forces, self._factors = memoryview(data.actuator_force).cast("B"), factors
-        self._samples, self._energy = array("d"), 0.0
-
-    def sample(self) -> None:
-        """Store the present thrusts."""
-        self._samples.frombytes(self._forces)
+        self._samples, self._factors, self._energy = array("d"), factors, 0.0
+        forces = memoryview(data.actuator_force).cast("B")
+        self.sample: Callable[[], None] = partial(self._samples.frombytes, forces)
 
     def read(self, period: float) -> float:
         """Return the energy of all samples [J], which are `period` [s] apart."""
         thrusts = np.abs(np.array(self._samples).reshape(-1, len(self._factors)))
         self._energy += float((thrusts * np.sqrt(thrusts) * self._factors).sum()) * period
-        self._samples = array("d")
+        del self._samples[:]
         return self._energy
 
 

@@ -304,9 +304,8 @@ class MissionFlight:
                 away = dist(seen.position, track[-1][1])
                 self._advance(f"flown to their end, {away:.2f} m from the last one", now_ns)
             return
-        done = "over" if self.plan.unit == "step" else "reached"
         while self.state == FLYING and self.route.is_reached(seen, now_ns):
-            self._advance(done, now_ns)
+            self._advance("over" if self.plan.unit == "step" else "reached", now_ns)
 
     def _advance(self, how: str, now_ns: int) -> None:
         self._report("reached", f"{self.route.name} {how}", now_ns)

@@ -104,6 +104,8 @@ class WorldEndpoint(TunnelEnd):
         self._sample_period_ns = min(odometry_period_ns, ODOMETRY_PERIOD_NS)
         self._count_ns = start_ns + COUNT_PERIOD_NS
         self._scanner, self._scan_ns = scanner, NO_SCAN_NS
+        self._look = self._sample if scanner is None else self._sample_and_scan
+        self._look_ns = start_ns  # time of the next sample or scan
         self._scans, self._scans_from_ns = 0, start_ns  # number in this session, its beginning
         self._counted_slip_ns: int | None = None
         self._waiting: tuple[int, int, Command] | None = None
@@ -129,8 +131,7 @@ class WorldEndpoint(TunnelEnd):
 
     def next_deadline_ns(self) -> int:
         """Return when the next sample of the true state or scan is due [ns], monotonic clock."""
-        sample_ns, scan_ns = self._sample_ns, self._scan_ns
-        return (sample_ns if sample_ns < scan_ns else scan_ns) + self._slip_ns
+        return self._look_ns + self._slip_ns
 
     def handle_deadline(self, now_ns: int) -> None:
         """Simulate up to `now_ns` [ns]; send the telemetry that is due."""
@@ -189,16 +190,13 @@ class WorldEndpoint(TunnelEnd):
         if self._waiting is not None and (tick_ns < until_ns or samples):
             self._apply(tick_ns)
         while tick_ns < until_ns:
-            if tick_ns >= self._sample_ns:
-                self._sample(tick_ns)
-            if tick_ns >= self._scan_ns:
-                self._scan(tick_ns)
-            stop_ns = min(self._sample_ns, self._scan_ns, until_ns)
+            if tick_ns >= self._look_ns:
+                self._look(tick_ns)
+            look_ns = self._look_ns
+            stop_ns = look_ns if look_ns < until_ns else until_ns
             tick_ns = self._tick_ns = self._run_robot(tick_ns, stop_ns)
-        if samples and tick_ns == self._sample_ns:
-            self._sample(tick_ns)
-        if samples and tick_ns == self._scan_ns:
-            self._scan(tick_ns)
+        if samples and tick_ns == self._look_ns:
+            self._look(tick_ns)
 
     def _apply(self, now_ns: int) -> None:
         assert self._waiting is not None
@@ -237,6 +235,15 @@ class WorldEndpoint(TunnelEnd):
         if now_ns >= self._count_ns:
             self._record_counts(now_ns)
         self._sample_ns += self._sample_period_ns
+        self._look_ns = self._sample_ns
+
+    def _sample_and_scan(self, now_ns: int) -> None:
+        """Take the sample and the scan, those that are due."""
+        if now_ns >= self._sample_ns:
+            self._sample(now_ns)
+        if now_ns >= self._scan_ns:
+            self._scan(now_ns)
+        self._look_ns = min(self._sample_ns, self._scan_ns)
 
     def _scan(self, now_ns: int) -> None:
         """Scan and send the distances; the next scan is due at the first step of its period."""
@@ -323,6 +330,7 @@ class WorldEndpoint(TunnelEnd):
         epoch, now_ns = self._session.epoch, self._tick_ns
         if self._scanner is not None:
             self._scans, self._scans_from_ns, self._scan_ns = 0, now_ns, now_ns
+            self._look_ns = min(self._sample_ns, now_ns)
         self._records.append(SessionOpened(now_ns, "world", epoch, cause))
         for observer in self.robot.observers:
             observer.see_session(now_ns)

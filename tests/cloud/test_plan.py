@@ -169,7 +169,7 @@ def test_cloud_sends_a_controllers_own_plan_and_remembers_its_positions():
     sent, _ = command(a_loop, 1094)
     assert (sent.velocity, sent.yaw_rate) == ((1.0, 0.0, 0.0), 0.25)
     assert sent.plan == ((2.0, 0.0, 0.0), (3.0, 0.0, 0.0)), "the guard refuses the last one"
-    [(_, positions)] = a_loop.plans._plans.values()
+    [(_, positions)] = a_loop.plans.plans.values()
     assert positions[1:] == [(0.0, 1.0, 2.0), (3.0, 4.0, 5.0), (6.0, 7.0, 8.0)]
     assert controller.goal.position == (2.0, 2.0, 3.0)
     sent, _ = command(loop(None, LastSample(), controller, heard_ms=1090, echo_ms=1000), 1094)

@@ -37,7 +37,7 @@ class RunningMean(Estimator):
 
     def horizon(self, age: float) -> float:
         """Return the mean [s]. `age` has no effect."""
-        return max(0.0, self._mean)
+        return self._mean if self._mean > 0.0 else 0.0
 
 
 def build() -> RunningMean:

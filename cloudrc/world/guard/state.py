@@ -263,9 +263,9 @@ class Guard:
         """Take an accepted command of the mission; change to TRACK if it is time."""
         fresh_until_ns = command.basis_stamp_ns + self.command_age_max_ns
         self._play(command, now_ns)
-        yaw_rate = command.yaw_rate
-        self.yaw_rate = rules.clamp(yaw_rate, -self._yaw_rate_max, self._yaw_rate_max)
-        if self.yaw_rate != yaw_rate:
+        most, self.yaw_rate = self._yaw_rate_max, command.yaw_rate
+        if not -most <= self.yaw_rate <= most:
+            self.yaw_rate = rules.clamp(self.yaw_rate, -most, most)
             self.counts["limited_yaw_rate"] += 1
         if self.state is GROUND:
             self._alone_ns = now_ns
