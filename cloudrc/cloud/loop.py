@@ -22,7 +22,6 @@ from collections import Counter, deque
 from collections.abc import Callable
 from copy import copy, deepcopy
 from functools import lru_cache
-from itertools import takewhile
 from math import nan
 from typing import Any
 
@@ -79,6 +78,15 @@ Source: docs/reference/faults.md, "F23"."""
 
 
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
+
+
+def _possible(velocities: list[Vector]) -> list[Vector]:
+    """Return the velocities [m/s] before the first one that the guard takes in no plan."""
+    most = PLANNED_MAX
+    for number, (x, y, z) in enumerate(velocities):
+        if not (abs(x) <= most and abs(y) <= most and abs(z) <= most):
+            return velocities[:number]
+    return velocities
 
 
 class ControlLoop:
@@ -382,8 +390,7 @@ class ControlLoop:
             command, *rest = to_vectors(velocities[: self._planned + 1], "planned velocities")
             self._output = output = ControlOutput(command, RESULT.of(yaw_rate, "yaw rate"))
             positions = to_vectors(positions[: self._planned], "planned positions")
-            fits = takewhile(lambda velocity: max(map(abs, velocity)) <= PLANNED_MAX, rest)
-            return output, as_planned([*fits]), positions
+            return output, as_planned(_possible(rest)), positions
         except FAILURES as error:
             self.note_failure(plug_in, error, INSTEAD["controller"])
             return STAND_STILL, [], []

@@ -9,6 +9,8 @@ predictive control over unreliable networks affected by packet-dropouts", IEEE T
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import chain
 from math import inf, sqrt
 from typing import Any
 
@@ -31,8 +33,8 @@ LOOK = 2 * STEP
 """Time between two predicted states [s]: half of the states take less time, and are enough."""
 AHEAD = 40
 """Number of predicted states."""
-TIMES = LOOK * np.arange(1, AHEAD + 1)
-"""Times from now to the predicted states [s], shape (AHEAD,)."""
+TIMES: list[float] = (LOOK * np.arange(1, AHEAD + 1)).tolist()
+"""Times from now to the predicted states [s]."""
 MOVES = 40
 """Number of steps in which the command may change; then it is constant."""
 ACCELERATION_MAX = 6.0
@@ -102,7 +104,7 @@ class Mpc(Controller):
         present = self._present(dt)
         begin = model.step(present, LOOK)
         states = [(begin.position, begin.velocity), *_coast(model, present)]
-        positions, velocities = map(np.array, zip(*states, strict=True))
+        positions, velocities = map(_rows, zip(*states, strict=True))
         wanted, speeds = self._approach(positions[0], goals)
         errors = np.concatenate((wanted - positions, speeds - velocities))
         changes = self._optimum(errors.T[:, :, None], np.array(present)[:, None])
@@ -114,8 +116,8 @@ class Mpc(Controller):
         velocities += (self._velocity @ changes[:, :, None])[:, :, 0].T
         first = goals(0.0)
         yaw_rate = first.turns and GAIN_YAW * turn_to(first.yaw, begin.orientation_wxyz)
-        between = positions - STEP * velocities
-        every = np.stack((between, positions), axis=1).reshape(commands.shape)
+        every = np.empty((2 * AHEAD, 3))
+        every[::2], every[1::2] = positions - STEP * velocities, positions
         return Planned(commands, every, float(yaw_rate))
 
     def _present(self, dt: float) -> Vector:
@@ -130,18 +132,21 @@ class Mpc(Controller):
         speed, then with constant braking, at last exponentially: an optimum over 0.8 s does not
         know that the robot has to brake later.
         """
-        found = [goals(time) for time in TIMES.tolist()]
-        at = np.array([each.position for each in found])
-        moving = np.array([each.velocity for each in found])
+        found = [goals(time) for time in TIMES]
+        at = _rows([each.position for each in found])
+        moving = _rows([each.velocity for each in found])
         away = position - at[0]
-        left = distance = float(np.linalg.norm(away))
+        left = distance = sqrt(float(away @ away))
         braking, rests, speeds = BRAKING * self._acceleration, [], []
+        most = self._speed
         near = braking * NEAR**2  # in this distance the speed falls with the distance [m]
         for _ in range(AHEAD):
             speed = left / NEAR if left <= near else sqrt(braking * (2.0 * left - near))
-            speeds.append(min(speed, self._speed))
+            if speed > most:
+                speed = most
+            speeds.append(speed)
             rests.append(left)
-            left -= speeds[-1] * LOOK
+            left -= speed * LOOK
         way = away / (distance or 1.0)
         return at + np.outer(rests, way), moving - np.outer(speeds, way)
 
@@ -163,6 +168,11 @@ class Mpc(Controller):
             cost = self._cost[axis]
             changes[axis] = self._solve(cost, -cost @ changes[axis], self._sums, high, low)[0]
         return changes
+
+
+def _rows(vectors: Iterable[Vector]) -> Any:
+    """Return AHEAD vectors, shape (AHEAD, 3); `np.array` of tuples takes three times as long."""
+    return np.fromiter(chain.from_iterable(vectors), float, 3 * AHEAD).reshape(AHEAD, 3)
 
 
 def _coast(model: Model, velocity: Vector) -> list[tuple[Vector, Vector]]:
