@@ -5,7 +5,8 @@
 import logging
 from dataclasses import replace
 from functools import cache, partial
-from math import inf
+from itertools import product
+from math import atan2, inf
 from unittest.mock import Mock
 
 import numpy as np
@@ -216,6 +217,12 @@ def test_c_runs_the_steps_on_the_ground_and_of_the_take_off():
     assert seen[0] == seen[1]
     assert count.steps == 500
     assert robots[1].guard.take_off.over
+
+
+def test_what_c_calls_for_an_angle_has_the_bits_of_python():
+    values = (0.0, -0.0, 1.0, -0.3, inf, -inf, 5e-324, 1e300)
+    for y, x in product(values, repeat=2):
+        assert native._atan2()(y, x).hex() == atan2(y, x).hex()
 
 
 def test_python_looks_at_no_contact_that_goes_on(monkeypatch):
