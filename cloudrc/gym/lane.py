@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from cloudrc.link.carry.tcp.medium import Medium
 from cloudrc.link.carry.tcp.stream import MessageStream, run_due
-from cloudrc.link.library import Cut, LinkProfile, OneWay
+from cloudrc.link.library import KIND, Cut, LinkProfile, OneWay
 from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.opportunities import BYTES as OPPORTUNITY_BYTES
 from cloudrc.link.profile import DirectionProfile, Timeline
@@ -100,6 +100,8 @@ class Lane:
     def begin(self, episode: int) -> None:
         """Begin an episode without packets."""
         self._episode, self.queue = episode, PacketQueue()
+        self._link = self._way.begin(episode)
+        self._send = self._link.send_checked if self._link.corrupts else self._link.send
         self.sent = self._delays_ns = self._delivered = 0
         self._more_sent = self._more_lost = 0  # packets beyond one of each message
         if self.is_stream:
@@ -118,7 +120,7 @@ class Lane:
         self.sent += 1
         size = self._size + more
         if size <= self._plain:  # nearly all messages: save time
-            arrivals = self._way.send(self._episode, number, size, now_ns)
+            arrivals = self._send(self._episode, KIND, number, size, now_ns)
             if len(arrivals) > 1:
                 arrivals = (min(arrivals),)  # of two copies
         elif self.is_stream:
@@ -126,7 +128,7 @@ class Lane:
             return
         else:
             pieces = self._cut.pieces(number, size)
-            arrivals, lost = self._way.send_pieces(self._episode, pieces, now_ns)
+            arrivals, lost = self._link.send_pieces(self._episode, pieces, now_ns)
             self._more_sent += len(pieces) - 1
             self._more_lost += lost - (not arrivals)
         if arrivals:

@@ -333,6 +333,12 @@ class OneWay:
         sent_ns = range(0, _PACKETS * period_ns, period_ns)
         return numbers(sample(link, KIND, sent_ns, size, turn=self.profile.phase_packets))
 
+    def begin(self, episode: int) -> LinkDirection:
+        """Begin an episode anew; return its model, whose `send` checks no argument."""
+        (episode,) = _whole(episode=episode)
+        self._begin(episode)
+        return self._link
+
     def _begin(self, episode: int) -> None:
         self._episode, self._link, self._usual = episode, self._new(episode), None
 

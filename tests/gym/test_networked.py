@@ -71,6 +71,19 @@ def executed(link, **options):
     return [float(each[0]) for each in env.unwrapped.executed]
 
 
+@pytest.mark.parametrize("way", [{"jitter_ms": 9, "keep_order": True}, {"rate_kbit": 90}])
+def test_a_seed_repeats_the_network_also_if_packets_act_on_those_behind_them(way):
+    """Without it, packets of the new episode wait behind those of the old one."""
+    env = Networked(Counter(limit=50), {"uplink": {"delay_ms": 20, **way}})
+    answer = np.zeros(env.action_space.shape, np.float32)
+
+    def ages():
+        env.reset(seed=3)
+        return [env.step(answer)[-1]["cloudrc"]["observation_age"] for _ in range(50)]
+
+    assert ages() == ages()
+
+
 def test_without_an_answer_the_robot_repeats_its_action_or_executes_start():
     silent = {"downlink": {"blackouts": [{"start_s": 0.02, "duration_s": 0.02}]}}
     assert executed(silent) == [1, 2, 2, 2, 5, 6]
