@@ -17,19 +17,22 @@ import importlib
 import inspect
 import pkgutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points, packages_distributions, version
+from glob import escape, glob
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.outside.code import calling, load_file
 from cloudrc.outside.patience import telling_if_slow
 from cloudrc.outside.refusal import check_names, naming
 from cloudrc.outside.values import InvalidValueError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint  # its import takes longer than most commands
 
 PACKAGES = {
     "estimators": "cloudrc.cloud.estimators",
@@ -228,21 +231,42 @@ def _installed(kind: str) -> dict[str, EntryPoint]:
 
 def versions_of(top: str) -> list[str]:
     """Return names and versions of the packages that have installed a top-level package."""
+    from importlib.metadata import version
+
     return [f"{name} {version(name)}" for name in sorted({*_distributions().get(top, ())})]
 
 
-_distributions = cache(packages_distributions)
-"""Return top-level package -> names of the packages that have installed it."""
+@cache
+def _distributions() -> Mapping[str, list[str]]:
+    """Return top-level package -> names of the packages that have installed it."""
+    from importlib.metadata import packages_distributions
+
+    return packages_distributions()
 
 
 @cache  # the search takes milliseconds, which every flight of a sweep would pay
 def _entries(kind: str, path: tuple[str, ...]) -> dict[str, EntryPoint]:
     """Return the entry points of a kind in the packages on `path`, Python's search path."""
+    if f"[cloudrc.{kind}]" not in _declared(path):
+        return {}
     return {entry.name: entry for entry in _all_entries(path).select(group=f"cloudrc.{kind}")}
 
 
 @cache
+def _declared(path: tuple[str, ...]) -> str:
+    """Return the text of all files with entry points."""
+    files = (
+        file
+        for folder in path
+        for file in glob(f"{escape(str(folder) or '.')}/*-info/entry_points.txt")
+    )
+    return "".join(Path(file).read_text("utf-8", "replace") for file in files)
+
+
+@cache
 def _all_entries(path: tuple[str, ...]) -> Any:
+    from importlib.metadata import entry_points
+
     return entry_points()
 
 

@@ -3,7 +3,6 @@
 """Plug-ins are found by name, entry point or path; an error lists the known names."""
 
 import sys
-from importlib.metadata import EntryPoint, EntryPoints
 
 import pytest
 
@@ -91,10 +90,12 @@ def test_a_plug_in_that_lacks_a_method_is_refused_before_the_flight(share, kind)
 
 def test_installed_packages_add_plug_ins(share, monkeypatch):
     values = {"as_module": "share", "as_function": "share:build", "last_sample": "share"}
-    group = "cloudrc.predictors"
-    entries = tuple(EntryPoint(name, value, group) for name, value in values.items())
+    lines = [f"{name} = {value}" for name, value in values.items()]
+    about = share.parent / "mine-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Name: mine\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("\n".join(["[cloudrc.predictors]", *lines]))
     monkeypatch.syspath_prepend(str(share.parent))
-    monkeypatch.setattr(plugins, "entry_points", lambda: EntryPoints(entries))
     assert {"as_module", "as_function"} <= set(plugins.names("predictors"))
     assert plugins.names("predictors").count("last_sample") == 1
     assert plugins.load("predictors", "as_module").share == 0.5
