@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import pairwise
 from math import nan
 from typing import Any
 
@@ -31,32 +33,21 @@ class Answers:
 
     An answer has a number: the tick of its observation, or, if the policy answers in every step,
     the tick in which it is asked. Then one observation may be behind several answers.
+
+    Attributes:
+        observed: Tick of each observation that was sent -> when it was observed [ns].
+        arrived: Tick of each observation that arrived -> when [ns].
+        begun: Number of each answer -> tick of its observation, and when it was begun [ns].
+        left: Number of each answer that was sent -> when it left [ns].
+        received: Number of each answer that arrived -> when [ns]; the last one is the newest.
     """
 
     def __init__(self) -> None:
         """Begin an episode."""
-        self._observations: dict[int, list[int]] = {}  # by tick: observed, sent, arrived [ns]
-        # By number: tick of the observation; begun, left, received, executed [ns].
-        self._answers: dict[int, list[int]] = {}
-        self._newest = 0  # number of the answer that was received last
-
-    def ask(self, tick: int, now_ns: int) -> None:
-        """Note that the observation of a tick is sent at once [ns]."""
-        self._observations[tick] = [now_ns, now_ns, NEVER_NS]
-
-    def arrive(self, tick: int, at_ns: int) -> None:
-        """Note the arrival of the observation of a tick [ns]."""
-        self._observations[tick][ARRIVED] = at_ns
-
-    def begin(self, number: int, tick: int, at_ns: int) -> None:
-        """Note that the policy begins an answer to the observation of a tick [ns]."""
-        self._answers[number] = [tick, at_ns, NEVER_NS, NEVER_NS, NEVER_NS]
-
-    def note(self, number: int, instant: int, at_ns: int) -> None:
-        """Note an instant [ns] of an answer: `LEFT` or `RECEIVED`."""
-        self._answers[number][instant - ARRIVED] = at_ns
-        if instant == RECEIVED:
-            self._newest = number
+        self.observed, self.arrived = dict[int, int](), dict[int, int]()
+        self.begun = dict[int, tuple[int, int]]()
+        self.left, self.received = dict[int, int](), dict[int, int]()
+        self._executed = dict[float, int]()
 
     def execute(self, basis: float, now_ns: int) -> None:
         """Note the execution of an action in a tick that began at `now_ns` [ns].
@@ -64,35 +55,44 @@ class Answers:
         `basis` is the number of its answer; if several answers are behind it, the one that was
         received last counts.
         """
-        number = int(basis) if basis == int(basis) else self._newest
-        row = self._answers.get(number)
-        if row is not None and row[-1] < 0 <= row[-2]:  # received, and not executed yet
-            row[-1] = max(now_ns, row[-2])
+        if basis != int(basis):
+            basis = next(reversed(self.received), 0)
+        if basis in self.received and basis not in self._executed:
+            self._executed[basis] = max(now_ns, self.received[int(basis)])
+
+    def _rows(self) -> Iterator[tuple[int, ...]]:
+        """Yield tick of the observation and the instants of `CUTS` [ns] of each answer."""
+        for number, (tick, begun_ns) in self.begun.items():
+            observed_ns, ends = self.observed[tick], (self.left, self.received, self._executed)
+            instants = [end.get(number, NEVER_NS) for end in ends]
+            yield tick, observed_ns, observed_ns, self.arrived[tick], begun_ns, *instants
 
     def table(self) -> dict[str, Instants]:
         """Return `tick` of the observation and the instants of `CUTS` [ns], each of shape (n,).
 
         A row is an answer, or an observation without one. -1 stands for what never happened.
         """
-        answers: dict[int, list[list[int]]] = {}  # by tick of their observation
-        for tick, *instants in self._answers.values():
-            answers.setdefault(tick, []).append(instants)
-        none = [[NEVER_NS] * 4]
-        found = [
-            [tick, *observed, *instants]
-            for tick, observed in self._observations.items()
-            for instants in answers.get(tick, none)
-        ]
+        answers: dict[int, list[tuple[int, ...]]] = {}  # by tick of their observation
+        for row in self._rows():
+            answers.setdefault(row[0], []).append(row)
+        found = list[tuple[int, ...]]()
+        for tick, now_ns in self.observed.items():
+            arrived_ns = self.arrived.get(tick, NEVER_NS)
+            none = tick, now_ns, now_ns, arrived_ns, *[NEVER_NS] * 4
+            found += answers.get(tick, [none])
         columns = np.array(found, np.int64).reshape(-1, 1 + len(CUTS)).T
         return dict(zip(("tick", *CUTS), columns, strict=True))
 
     def means(self) -> dict[str, float]:
         """Return `budget_` and the name of each stage -> its mean [s] over executed answers."""
-        table = self.table()
-        cuts_ns = np.array([table[name] for name in CUTS])
-        lengths_ns = np.diff(cuts_ns[:, cuts_ns[EXECUTED] != NEVER_NS], axis=0)
-        means = (lengths_ns.mean(axis=1) * 1e-9).tolist() if lengths_ns.size else [nan] * 6
-        return {f"budget_{name}": mean for name, mean in zip(STAGES, means, strict=True)}
+        executed = [row for row in self._rows() if row[-1] != NEVER_NS]
+        # Whole numbers: the sum of differences is the difference of sums.
+        _, *sums_ns = map(sum, zip(*executed, strict=True)) if executed else [nan] * 8
+        count = max(1, len(executed))
+        return {
+            f"budget_{name}": (end_ns - begin_ns) / count * 1e-9
+            for name, (begin_ns, end_ns) in zip(STAGES, pairwise(sums_ns), strict=True)
+        }
 
 
 def to_document(table: dict[str, Instants]) -> dict[str, Any]:

@@ -49,13 +49,23 @@ class Met(NamedTuple):
     duration_ns: int
 
 
-def asked_of(wire: Wire, period: float, met: Met) -> tuple[float, float]:
-    """Return the mean delay [s] and the loss of messages, one per `period` [s], in what was met."""
-    if parts := _parts_of(wire, period):
-        return parts.of(met)
-    # A queue that fills has no mean but that of the messages which were sent.
-    count = ceil(met.duration_ns * 1e-9 / period) if wire.exceeds_rate(period) else 0
-    return expected(wire, period, count)
+class AskedOfWire:
+    """What a wire asks for in the episodes of one link."""
+
+    def __init__(self, wire: Wire, period: float) -> None:
+        """Take messages, one per `period` [s]."""
+        self._wire, self._period = wire, period
+        self._parts = _parts_of(wire, period)
+        # A queue that fills has no mean but that of the messages which were sent.
+        fills = self._parts is None and wire.exceeds_rate(period)
+        self._always = None if self._parts or fills else expected(wire, period)
+
+    def of(self, met: Met) -> tuple[float, float]:
+        """Return the mean delay [s] and the loss of messages in what was met."""
+        if self._parts:
+            return self._parts.of(met)
+        count = ceil(met.duration_ns * 1e-9 / self._period)
+        return self._always or expected(self._wire, self._period, count)
 
 
 @lru_cache(maxsize=64)

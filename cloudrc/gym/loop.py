@@ -35,15 +35,16 @@ from weakref import WeakValueDictionary
 import numpy as np
 from gymnasium.error import ResetNeeded
 
-from cloudrc.gym.answers import LEFT, RECEIVED, Answers, Instants
-from cloudrc.gym.asked import Met, asked_of, expected
+from cloudrc.gym.ages import describe_ages
+from cloudrc.gym.answers import Answers, Instants
+from cloudrc.gym.asked import AskedOfWire, Met, expected
 from cloudrc.gym.doubts import doubts
 from cloudrc.gym.executors import Chunk, Committed, Executor
 from cloudrc.gym.lane import Lane, Wire
 from cloudrc.gym.links import Choose, Chosen
 from cloudrc.gym.memory import Remembering
 from cloudrc.gym.values import copied, size_of
-from cloudrc.link.draws import Floats, stream_key
+from cloudrc.link.draws import stream_key
 from cloudrc.link.library import LinkProfile
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.metrics.age import most_missed
@@ -98,8 +99,6 @@ class RemoteLoop:
     Attributes:
         seen: The newest observation that the policy has taken, and the environment's info about it.
         is_asked: Whether this observation is new, so that the policy's next answer is sent.
-        compute: Function that returns how long the policy computes the answer to the observation
-            of a tick [s]; at first, it is that of the settings.
         start: What the robot executes without any answer.
         memory: What the policy remembers beside this observation.
         answers: When each answer of the episode was asked for, made and executed.
@@ -131,7 +130,10 @@ class RemoteLoop:
         self._stream, self._episode = stream, -1
         self._connect()
         self._within_ns = round(settings.answer_within * 1e9)
-        self.compute: Callable[[int], float] = self._draw_time
+        self.compute = self._draw_time
+        mean, deviation = settings.compute
+        self._compute_ns = None if deviation else round(mean * 1e9)
+        self._asks_always = type(executor).asks is Executor.asks
         self.seen: list[Any] = [None, {}]
         self.is_asked = False
 
@@ -142,6 +144,8 @@ class RemoteLoop:
         up, down = self._settings.wires(link)
         self._up = self._lane(up, seed, stream, start)
         self._down = Lane(down, seed, stream, start)
+        self._late: int | None = None  # expected age of the loop [ticks]
+        self._asked: tuple[AskedOfWire, AskedOfWire] | None = None
 
     def begin(self, seed: int | None, observation: Any, info: Mapping[str, Any]) -> None:
         """Begin an episode: the policy has the first observation at once.
@@ -175,12 +179,12 @@ class RemoteLoop:
         self._fresh_ages = list[float]()  # of new actions since the first of _action_ages, else NaN
         self._executor.basis = -1
         self.answers = Answers()
-        self.answers.ask(0, 0)
-        self.answers.arrive(0, 0)
-        self.answers.begin(0, 0, 0)
+        self.answers.observed[0] = self.answers.arrived[0] = 0
+        self.answers.begun[0] = 0, 0
         self.memory.begin()
-        late = self._ticks_late((self._up.wire, self._down.wire))
-        self._executor.begin(late, round(self._settings.dt * 1e9))
+        if self._late is None:
+            self._late = self._ticks_late((self._up.wire, self._down.wire))
+        self._executor.begin(self._late, round(self._settings.dt * 1e9))
 
     def _meet_twin(self) -> None:
         """Say once if another robot is in the same episode of the same network, which draws."""
@@ -214,9 +218,8 @@ class RemoteLoop:
         """
         settings, wires = self._settings, self._settings.wires(link)
         dt, compute, late = settings.dt, settings.compute[0], self._ticks_late(wires)
-        asks_always = type(self._executor).asks is Executor.asks
-        yield from doubts(wires, dt, asks_always=asks_always)
-        if asks_always and any(wire.exceeds_rate(dt) for wire in wires):
+        yield from doubts(wires, dt, asks_always=self._asks_always)
+        if self._asks_always and any(wire.exceeds_rate(dt) for wire in wires):
             return  # the delay grows from message to message, so its mean says nothing
         if late < longest:
             if text := self._executor.doubt(count, late):
@@ -231,9 +234,9 @@ class RemoteLoop:
     def act(self, actions: tuple[Any, ...]) -> Any:
         """Take the policy's answer, if it is asked; return the action that the robot executes."""
         tick, executor = self._tick, self._executor
-        if tick < 0:
-            raise ResetNeeded("call reset() before step()")
-        if not tick:
+        if tick <= 0:
+            if tick < 0:
+                raise ResetNeeded("call reset() before step()")
             self._meet_twin()
         if self.is_asked:
             self.memory.add(actions[0])
@@ -265,30 +268,29 @@ class RemoteLoop:
         chunk = Chunk(self._number, actions)
         if self._settings.waits and not self._tick:
             self._executor.receive(chunk, 0)  # the episode begins when this answer has arrived
-            self.answers.note(0, LEFT, 0)
-            self.answers.note(0, RECEIVED, 0)
+            self.answers.left[0] = self.answers.received[0] = 0
             self._reached.append((0, 0))
             return
-        self._free_ns = self._begin_ns + self._time_to_compute()  # which may be known only now
-        self.answers.note(self._number, LEFT, self._free_ns)
-        self._down.send(self._number, self._free_ns, chunk)
+        self._free_ns = free_ns = self._begin_ns + self._time_to_compute()  # known only now
+        self.answers.left[self._number] = free_ns
+        self._down.send(self._number, free_ns, chunk)
 
     def _receive(self, limit_ns: int) -> None:
         """Give the executor the answers that have arrived by `limit_ns` [ns]."""
         if self._down.is_stream:
             self._down.run(limit_ns)
-        queue = self._down.queue
+        queue, settings, tick = self._down.queue, self._settings, self._tick
         while queue.next_ns <= limit_ns:
             at_ns, _, chunk = queue.pop()
-            self.answers.note(chunk.basis, RECEIVED, at_ns)
             basis = chunk.basis
-            if self._settings.answers_each_tick:
+            self.answers.received[basis] = at_ns
+            if settings.acknowledges:
+                self._reached.append((at_ns, basis))
+            if settings.answers_each_tick:
                 basis = self._sources[basis]
             if basis:
-                self._loop_ages.append(self._tick - basis)
-            if self._settings.acknowledges:
-                self._reached.append((at_ns, chunk.basis))
-            self._executor.receive(chunk, self._tick)
+                self._loop_ages.append(tick - basis)
+            self._executor.receive(chunk, tick)
 
     def observe(self, observation: Any, info: Mapping[str, Any]) -> None:
         """Move to the next tick, in which the world gives an observation and its info."""
@@ -303,12 +305,12 @@ class RemoteLoop:
         self._tick = tick = self._tick + 1
         self._now_ns = now_ns = round(tick * self._settings.dt * 1e9)
         self._receive(now_ns)
-        if self._executor.asks(tick, observation):
+        if self._asks_always or self._executor.asks(tick, observation):
             committed = self._executor.committed(tick)
             message = (tick, committed, copied(observation), dict(info))
             more = size_of(committed.actions) if committed.actions else 0
             self._up.send(tick, now_ns, message, more)
-            self.answers.ask(tick, now_ns)
+            self.answers.observed[tick] = now_ns
 
     def ask(self) -> None:
         """Let the policy take what arrives in this tick before the robot acts, and begin."""
@@ -331,12 +333,17 @@ class RemoteLoop:
         if self._up.is_stream:
             self._up.run(limit_ns)
         queue, begins = self._up.queue, not self._settings.answers_each_tick
-        while (begin_ns := max(queue.next_ns, begins * self._free_ns)) <= limit_ns:
+        while (begin_ns := queue.next_ns) <= limit_ns:
+            if begins and self._free_ns > begin_ns:
+                begin_ns = self._free_ns
+                if begin_ns > limit_ns:
+                    return
             before = self._seen_tick
             while queue.next_ns <= begin_ns:
                 self._taken_ns, _, message = queue.pop()
-                self.answers.arrive(message[0], self._taken_ns)
-                if message[0] > self._seen_tick:
+                tick = message[0]
+                self.answers.arrived[tick] = self._taken_ns
+                if tick > self._seen_tick:
                     self._seen_tick, self._committed, *self.seen = message
             if begins and self._seen_tick > before:
                 self.is_asked = True
@@ -346,11 +353,25 @@ class RemoteLoop:
         """Let the policy begin the answer with a number at a time [ns]."""
         self._number, self._begin_ns = number, begin_ns
         self._free_ns = begin_ns + self._time_to_compute()
-        self.answers.begin(number, self._seen_tick, begin_ns)
+        self.answers.begun[number] = self._seen_tick, begin_ns
 
     def _time_to_compute(self) -> int:
         """Return how long the policy computes its newest answer [ns]."""
-        return round(self.compute(self._number) * 1e9)
+        if self._compute_ns is not None:
+            return self._compute_ns
+        return round(self._compute(self._number) * 1e9)
+
+    @property
+    def compute(self) -> Callable[[int], float]:
+        """Function that returns how long the policy computes an answer [s].
+
+        It takes the tick of the observation; at first, the time is that of the settings.
+        """
+        return self._compute
+
+    @compute.setter
+    def compute(self, time: Callable[[int], float]) -> None:
+        self._compute, self._compute_ns = time, None
 
     def _draw_time(self, tick: int) -> float:
         mean, deviation = self._settings.compute
@@ -364,16 +385,19 @@ class RemoteLoop:
 
     def observed(self) -> Any:
         """Return a copy of the newest observation that the policy has taken, with its memory."""
+        observation = copied(self.seen[0])
+        if not self.memory.adds:
+            return observation
         age = (self._tick - self._seen_tick) * self._settings.dt
-        return self.memory.beside(copied(self.seen[0]), age=age, step=self._seen_tick)
+        return self.memory.beside(observation, age=age, step=self._seen_tick)
 
     def told(self) -> dict[str, Any]:
         """Return what the policy may know about the loop, as `info["cloudrc"]`."""
-        dt = self._settings.dt
+        dt, tick, basis = self._settings.dt, self._tick, self._basis
         found: dict[str, Any] = {
             "asked": self.is_asked,
-            "observation_age": (self._tick - self._seen_tick) * dt,
-            "action_age": (self._tick - 1 - self._basis) * dt if self._basis >= 0 else inf,
+            "observation_age": (tick - self._seen_tick) * dt,
+            "action_age": (tick - 1 - basis) * dt if basis >= 0 else inf,
             "held": self._is_held,
             "lost_uplink": self._up.queue.lost,
             "lost_downlink": self._down.queue.lost,
@@ -436,33 +460,21 @@ class RemoteLoop:
         link = self._chosen.profile
         start_ns = link.start_ns(self._settings.seed, self._episode, self._stream)
         met = Met(start_ns, round(ticks * dt * 1e9))
+        if self._asked is None:
+            self._asked = AskedOfWire(self._up.wire, dt), AskedOfWire(self._down.wire, dt)
+        uplink, downlink = self._asked
         return {
             "ticks": ticks,
             "link": self._chosen.name,
             "link_start": start_ns / 1e9,
             "loop_age": float(np.mean(self._loop_ages)) * dt if self._loop_ages else nan,
-            **_describe("observation_age", np.array(self._observation_ages) * dt, dt),
-            **_describe("action_age", actions, dt),
+            **describe_ages("observation_age", np.array(self._observation_ages) * dt, dt),
+            **describe_ages("action_age", actions, dt),
             "age_counts": np.bincount(rounded.astype(int)).tolist(),
             "late_share": late,
             "misses_in_10": most_missed(~is_new) if len(is_new) else nan,
             "held_share": self._held / ticks if ticks else nan,
             **self.answers.means(),
-            "uplink": self._up.summary(asked_of(self._up.wire, dt, met)),
-            "downlink": self._down.summary(asked_of(self._down.wire, dt, met)),
+            "uplink": self._up.summary(uplink.of(met)),
+            "downlink": self._down.summary(downlink.of(met)),
         }
-
-
-def _describe(name: str, ages: Floats, dt: float) -> dict[str, float]:
-    """Return numbers of the ages [s] in successive steps of `dt` [s], shape (n,).
-
-    A peak is the age in the last step before that of a fresher observation.
-    """
-    found = {"mean": nan, "p99": nan, "max": nan, "peak_mean": nan}
-    if len(ages):
-        found |= {"mean": ages.mean(), "p99": np.percentile(ages, 99.0), "max": ages.max()}
-    peaks = ages[:-1][np.diff(ages) < dt - 1e-9]
-    if len(peaks):
-        found["peak_mean"] = peaks.mean()
-    numbers = {f"{name}_{part}": float(value) for part, value in found.items()}
-    return {**numbers, f"{name}_of": len(ages)}

@@ -29,6 +29,7 @@ class Remembering:
     """Puts memory beside an observation.
 
     Attributes:
+        adds: Whether an observation has memory.
         space: That of an observation with memory: `observation`, that of the environment; `age`
             [s], shape (1,); `step`, in which it was taken, shape (1,); `actions`, the last ones
             that the policy has sent, the oldest first. Without memory, it is that of the
@@ -55,7 +56,8 @@ class Remembering:
                 self._parts[name] = spaces.Box(0.0, np.inf, (1,), np.float32)
         if self._count:
             self._parts["actions"] = batch_space(self._actions, self._count)
-        if len(self._parts) > 1:
+        self.adds = len(self._parts) > 1
+        if self.adds:
             self.space = spaces.Dict(self._parts)
         self.begin()
 
@@ -69,8 +71,6 @@ class Remembering:
 
     def beside(self, observation: Any, **numbers: float) -> Any:
         """Return an observation with the memory; `numbers` are its `age` [s] and its `step`."""
-        if len(self._parts) == 1:
-            return observation
         found = {"observation": observation}
         for name in NUMBERS:
             if name in self._parts:

@@ -144,7 +144,8 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             action = to_arrays(action)
         self._check(action)
         loop = self._loop
-        executed = loop.act(self._split(action))
+        # No other action is sent, so no other is copied.
+        executed = loop.act(self._split(action) if loop.is_asked else ())
         observation, reward, terminated, truncated, self.world_info = self.env.step(executed)
         loop.observe(observation, self.world_info)
         seen, info = self._seen()

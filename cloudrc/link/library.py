@@ -340,11 +340,15 @@ class OneWay:
         return self._link
 
     def _begin(self, episode: int) -> None:
-        self._episode, self._link, self._usual = episode, self._new(episode), None
+        self._episode, self._usual = episode, None
+        self._link.restart(self._origin_ns(episode))
 
     def _new(self, episode: int) -> LinkDirection:
-        origin_ns = -self._start(episode) if self._start else 0
-        return LinkDirection(self.profile, self._seed, self._uplink, origin_ns, stream=self._stream)
+        origin_ns, stream = self._origin_ns(episode), self._stream
+        return LinkDirection(self.profile, self._seed, self._uplink, origin_ns, stream=stream)
+
+    def _origin_ns(self, episode: int) -> int:
+        return -self._start(episode) if self._start else 0
 
     def _independent(self, conditions: Conditions, episode: int, first: int, count: int) -> Floats:
         """Compute the delays [s] of packets with independent random numbers, shape (count,)."""

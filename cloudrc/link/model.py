@@ -119,6 +119,14 @@ class LinkDirection:
         self._fates: dict[tuple[int, int, int, float, Loss], list[Fate]] = {}
         self._place: tuple[int, int, int, Conditions] | None = None
 
+    def restart(self, origin_ns: int) -> None:
+        """Begin as a new model does, at `origin_ns` [ns]; blocks that were drawn are kept."""
+        self._origin_ns, self._start_ns = origin_ns, 0
+        self._departures.clear()
+        self._last_release_ns = self.blackouts = 0
+        if self._opportunities is not None:
+            self._opportunities.restart()
+
     def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
         """Send one packet of `size` bytes of UDP payload at `now_ns` [ns]; compute when it arrives.
 

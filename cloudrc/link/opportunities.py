@@ -23,6 +23,10 @@ class Opportunities:
     def __init__(self, times_ns: Sequence[int]) -> None:
         """Begin with all opportunities, at `times_ns` and then again after the last one."""
         self._times_ns, self._period_ns = times_ns, times_ns[-1]
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin before the first opportunity."""
         self._place = -1  # of the opportunity at which the last packet left, counted from the first
         self._left = 0  # what may still leave there [bytes]
 

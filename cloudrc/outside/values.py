@@ -115,12 +115,21 @@ class Quantity:
             return values
         return [self._numbers(each, (*place, n), name) for n, each in enumerate(values)]
 
+    def has_floats(self, numbers: NDArray[Any]) -> bool:
+        """Return whether an array has few floating-point numbers, in the range and finite.
+
+        For large arrays and others, call `array`.
+        """
+        if not 0 < numbers.size <= FEW or numbers.dtype.kind != "f":
+            return False
+        few = numbers.ravel().tolist()
+        # The least of several numbers may hide a NaN.
+        return isfinite(sum(few)) and self._spans(min(few), max(few))
+
     def _has_all(self, numbers: NDArray[Any]) -> bool:
         """Return whether all numbers of an array are in the range and finite."""
-        if numbers.size <= FEW and numbers.dtype.kind == "f":
-            few = numbers.ravel().tolist()
-            if isfinite(sum(few)):  # the least of several numbers may hide a NaN
-                return self._spans(min(few), max(few))
+        if self.has_floats(numbers):
+            return True
         return self._spans(numbers.min().item(), numbers.max().item())
 
     def _spans(self, low: float, high: float) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cloudrc.gym import Networked
+from cloudrc.gym.ages import describe_ages
 from cloudrc.gym.answers import CUTS, NEVER_NS, to_document
 from cloudrc.timeline.loops import of_document
 from cloudrc.timeline.text import as_text
@@ -84,3 +85,9 @@ def test_a_timeline_of_an_episode_tells_where_the_other_answers_ended():
     assert len(document["ticks"]) <= 101
     _, flows = check_rules(json.loads(write_trace({"episode": loop}, 0.0, 60.0))["traceEvents"])
     assert len(flows) > 20
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 50, 51, 100, 101, 977])
+def test_the_percentile_of_ages_is_that_of_numpy_bit_by_bit(count):
+    ages = np.random.default_rng(count).integers(0, 40, count) * 0.02
+    assert describe_ages("age", ages, 0.02)["age_p99"] == np.percentile(ages, 99.0)

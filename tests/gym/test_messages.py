@@ -12,7 +12,7 @@ from gymnasium.wrappers import TimeLimit
 
 import cloudrc.link
 from cloudrc.gym import Networked
-from cloudrc.gym.asked import Met, asked_of, expected
+from cloudrc.gym.asked import AskedOfWire, Met, expected
 from cloudrc.gym.doubts import LinkWarning
 from cloudrc.gym.lane import Lane, Wire
 from cloudrc.link.carry.tcp.stream import MessageStream, Segment
@@ -206,7 +206,7 @@ def test_a_rate_that_is_exceeded_is_told_and_no_delay_guessed(megabit):
 def test_the_delay_of_a_queue_that_fills_is_asked_of_the_messages_of_the_episode():
     link = {"rate_kbit": 500, "queue_packets": 10_000}
     found, _ = delays({"uplink": link}, 40_000, "stream", 50, 20)
-    asked = asked_of(wire({"uplink": link}, 40_000, "stream"), 0.02, Met(0, 50 * 20 * MS))
+    asked = AskedOfWire(wire({"uplink": link}, 40_000, "stream"), 0.02).of(Met(0, 50 * 20 * MS))
     assert asked == pytest.approx((found.mean() / 1e3, 0.0))
     assert found[-1] > 40 * found[0]
 
