@@ -268,7 +268,7 @@ class LinkDirection:
                 departure = self._use_opportunity(size + HEADER_BYTES, now_ns)
             if departure is None:
                 return None
-            parts = self.radio_parts(*packet, departure, copy)
+            parts = self.radio_parts(*packet, departure, copy) if self._radio else None
             waited = departure > now_ns or parts is not None
             if waited and copy == 0 and self.watch is not None:
                 self.watch(packet, now_ns, departure - now_ns, parts)
