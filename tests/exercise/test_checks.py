@@ -86,13 +86,13 @@ def test_an_error_costs_the_points_that_it_concerns(part, right, wrong, lost, sa
 
 @pytest.mark.process
 def test_whatever_a_file_does_the_other_parts_are_scored(tmp_path):
-    (tmp_path / "delay_estimator.py").write_text("while True:\n    print('on and on')\n")
+    (tmp_path / "delay_estimator.py").write_text("while True: print('on and on')\n")
     (tmp_path / "predictor.py").write_text("import sys\nsys.exit('no')\n")
     (tmp_path / "controller.py").write_text("import os\nos._exit(0)\n")
     rows = list(scoring.check(tmp_path, limits=Limits(seconds=4)))
     seen = {row["part"]: row["seen"] for row in rows}
     assert [row["test"] for row in rows] == [*chain(*ALL.values())]
-    assert seen["estimator"] == "delay_estimator.py:2: no end after 4 s of processor time"
+    assert seen["estimator"] == "delay_estimator.py:1: no end after 4 s of processor time"
     assert seen["predictor"] == "predictor.py:2: SystemExit: no (sys.exit() was called)"
     assert seen["controller"].startswith("controller.py: ended the process of the check")
     assert {row["points"] for row in rows} == {0.0}
