@@ -131,20 +131,14 @@ class CloudEndpoint(TunnelEnd):
         self._unsent: tuple[int, Datagram | None] | None = None  # departure [ns] and command
         self._asked = 0  # highest number of an operator request in this session
         self._start: tuple[int, int] | None = None  # number and time [ns] of the newest START
-        self._on_arrival = on_arrival
-        self._commanded_ns = NEVER_NS
-        self._begin_periods(start_ns)
-
-    def _begin_periods(self, start_ns: int) -> None:
-        """Let all that is done periodically begin at `start_ns` [ns]."""
-        self._tick_ns = start_ns
-        self._due_ns = start_ns  # when a command is due, with answers on arrival
+        self._on_arrival, self._due_ns = on_arrival, start_ns  # when a command is due, if so [ns]
+        self._tick_ns = self._heard_ns = start_ns
         self._hello_ns = start_ns - KEY_PERIOD_NS  # time of the last periodic hello
-        self._alive_ns = start_ns  # time of the next ALIVE while there are no commands
-        self._quiet_ns = start_ns  # likewise while commands are withheld
-        self._heard_ns = start_ns
+        # Time of the next ALIVE while there are no commands, and while they are withheld.
+        self._alive_ns = self._quiet_ns = start_ns
+        self._commanded_ns = NEVER_NS
         self._count_ns = start_ns + COUNT_PERIOD_NS
-        self._late_ns, self._late_window_ns = 0, start_ns  # missed time, begin of its window
+        self._late_ns, self._late_window_ns = 0, start_ns  # missed time, begin of its window [ns]
 
     @property
     def lost(self) -> ControllerLostError | None:
