@@ -99,6 +99,8 @@ class RemoteLoop:
     Attributes:
         seen: The newest observation that the policy has taken, and the environment's info about it.
         is_asked: Whether this observation is new, so that the policy's next answer is sent.
+        compute: Function that returns how long the policy computes the answer to the observation
+            of a tick [s]; at first, it is that of the settings.
         start: What the robot executes without any answer.
         memory: What the policy remembers beside this observation.
         answers: When each answer of the episode was asked for, made and executed.
@@ -130,9 +132,7 @@ class RemoteLoop:
         self._stream, self._episode = stream, -1
         self._connect()
         self._within_ns = round(settings.answer_within * 1e9)
-        self.compute = self._draw_time
-        mean, deviation = settings.compute
-        self._compute_ns = None if deviation else round(mean * 1e9)
+        self.compute: Callable[[int], float] = self._draw_time
         self._asks_always = type(executor).asks is Executor.asks
         self.seen: list[Any] = [None, {}]
         self.is_asked = False
@@ -357,21 +357,7 @@ class RemoteLoop:
 
     def _time_to_compute(self) -> int:
         """Return how long the policy computes its newest answer [ns]."""
-        if self._compute_ns is not None:
-            return self._compute_ns
-        return round(self._compute(self._number) * 1e9)
-
-    @property
-    def compute(self) -> Callable[[int], float]:
-        """Function that returns how long the policy computes an answer [s].
-
-        It takes the tick of the observation; at first, the time is that of the settings.
-        """
-        return self._compute
-
-    @compute.setter
-    def compute(self, time: Callable[[int], float]) -> None:
-        self._compute, self._compute_ns = time, None
+        return round(self.compute(self._number) * 1e9)
 
     def _draw_time(self, tick: int) -> float:
         mean, deviation = self._settings.compute
