@@ -89,6 +89,11 @@ FOREVER_NS = 1 << 62
 NO_COMMAND = Command(NEVER_NS, NEVER_NS, 0, ZERO, 0.0)
 
 
+def _is_plan_possible(command: Command) -> bool:
+    ahead_ns = command.planned_ns - command.basis_stamp_ns
+    return 0 <= ahead_ns <= AGE_MAX_NS and rules.within(command.plan, COMMAND_MAX)
+
+
 class Guard:
     """The state machine of the guard, on world's clock. It begins in the state GROUND.
 
@@ -253,7 +258,7 @@ class Guard:
             return "future"
         if age_ns > self.command_age_max_ns:
             return "stale"
-        if command.plan and not self._is_plan_possible(command):
+        if command.plan and not _is_plan_possible(command):
             return "range"
         if self._planar and (z or any(planned[2] for planned in command.plan)):
             return "vertical"
@@ -277,10 +282,6 @@ class Guard:
             self._track_until_ns = fresh_until_ns
             if command.plan:
                 self._track_until_ns = max(fresh_until_ns, self._plan_end_ns(command, now_ns))
-
-    def _is_plan_possible(self, command: Command) -> bool:
-        ahead_ns = command.planned_ns - command.basis_stamp_ns
-        return 0 <= ahead_ns <= AGE_MAX_NS and rules.within(command.plan, COMMAND_MAX)
 
     def _plan_end_ns(self, command: Command, now_ns: int) -> int:
         """Return until when [ns] the robot may follow a plan that arrives at `now_ns` [ns]."""
