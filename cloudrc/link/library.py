@@ -8,7 +8,7 @@ direction, stream, episode and number of the packet alone, so two policies meet 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -270,17 +270,8 @@ class OneWay:
             usual = self._usual = size if self._usual is None else self._usual
         (usual,) = _whole(usual=usual)
         cut = Cut(packet_bytes).for_size(usual)
-        arrivals, _ = self.send_pieces(episode, cut.pieces(number, size), now_ns)
+        arrivals, _ = self._link.send_pieces(episode, cut.pieces(number, size), now_ns)
         return arrivals
-
-    def send_pieces(self, episode: int, pieces: Sequence[Piece], now_ns: int) -> tuple[Fate, int]:
-        """Send the pieces of a message; return its fate, and how many pieces are lost.
-
-        All arguments are right, and the time is that of `send_message`.
-        """
-        if episode != self._episode:
-            self._begin(episode)
-        return self._link.send_pieces(episode, pieces, now_ns)
 
     def table(
         self,
