@@ -38,9 +38,9 @@ from mcap.writer import MCAP0_MAGIC
 CHUNK_BYTES = 1024 * 1024
 """Size at which a chunk ends [bytes]."""
 COMPRESSION = "zstd"
-_HEAD = 9  # opcode and length of a record [bytes]
+HEAD, MESSAGE = Struct("<BQ"), Struct("<HIQQ")
+"""Begin of a record: opcode, length [bytes]; of a message: channel, number, two times [ns]."""
 _pack_message = Struct("<BQHIQQ").pack  # head, channel, number, log time, publish time
-_MESSAGE_BYTES = Struct("<HIQQ").size
 _INDEX_BYTES = Struct("<HI").size
 
 
@@ -110,10 +110,10 @@ class McapFile:
         if index is None:
             index = chunk.indices[channel] = []
         index += now_ns, chunk.size
-        length = _MESSAGE_BYTES + len(data)
+        length = MESSAGE.size + len(data)
         head = _pack_message(Opcode.MESSAGE, length, channel, number, now_ns, now_ns)
         chunk.parts += head, data
-        chunk.size += _HEAD + length
+        chunk.size += HEAD.size + length
         if chunk.size > CHUNK_BYTES:
             self._end_chunk()
 

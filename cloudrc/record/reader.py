@@ -20,7 +20,6 @@ from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
 from shlex import quote
-from struct import Struct
 from typing import IO, Any
 
 from mcap import records as mcap
@@ -34,6 +33,7 @@ from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file
 from cloudrc.record.content import Content, Message
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, of_metadata, union
+from cloudrc.record.mcap_file import HEAD, MESSAGE
 from cloudrc.record.ros import columns, decode, is_known
 from cloudrc.record.topics import TOPICS, VIEWS, Topic
 from cloudrc.record.writer import CLOCK, COUNTS, MISSING
@@ -46,8 +46,6 @@ KINDS = {
 """First bytes of a file that is not MCAP -> text of the error about the file."""
 
 
-_RECORD, _MESSAGE = Struct("<BQ"), Struct("<HIQQ")
-"""Begin of a record: opcode, length [bytes]; of a message: channel, sequence, two times [ns]."""
 _DEFINITIONS: dict[int, type[mcap.Channel | mcap.Schema]] = {
     Opcode.CHANNEL.value: mcap.Channel,
     Opcode.SCHEMA.value: mcap.Schema,
@@ -182,12 +180,12 @@ class _Reader:
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
         data, at = stream.read(size), 0
         while at < size:
-            opcode, length = _RECORD.unpack_from(data, at)
-            at += _RECORD.size
+            opcode, length = HEAD.unpack_from(data, at)
+            at += HEAD.size
             end = at + length
             if opcode == _IS_MESSAGE:
-                number, sequence, log_time, _ = _MESSAGE.unpack_from(data, at)
-                self._take_message(number, sequence, log_time, data[at + _MESSAGE.size : end])
+                number, sequence, log_time, _ = MESSAGE.unpack_from(data, at)
+                self._take_message(number, sequence, log_time, data[at + MESSAGE.size : end])
             elif opcode in _DEFINITIONS:
                 definition = ReadDataStream(BytesIO(data[at:end]))
                 self._take(_DEFINITIONS[opcode].read(definition))
