@@ -222,7 +222,7 @@ class Perceiver:
         setpoint: Setpoint | None = outcome.result
         if outcome.error is not None:
             self._note_failure(outcome.error)
-        _, begun_ns, done_ns = outcome[1:]
+        begun_ns, done_ns = outcome.begun_ns, outcome.done_ns
         times = begun_ns - look.arrived_ns, done_ns - begun_ns, done_ns
         place = NOWHERE if setpoint is None else setpoint.position
         made = Perceived(0, look.seen.stamp_ns, *times, NO_EPOCH, UNSENT, place)

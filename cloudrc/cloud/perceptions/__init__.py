@@ -8,12 +8,13 @@ returns a `Perception`; all parameters are annotated.
 
 from __future__ import annotations
 
-from math import atan2, cos, sin
+from math import cos, sin
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import Odometry, Setpoint, Vector
 
 
@@ -31,8 +32,7 @@ Seen: TypeAlias = Scan
 
 def yaw_of(odometry: Odometry) -> float:
     """Return the robot's heading [rad], world frame."""
-    w, x, y, z = odometry.orientation_wxyz
-    return atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return -turn_to(0.0, odometry.orientation_wxyz)
 
 
 def point_at(odometry: Odometry, angle: float, distance: float) -> Vector:
