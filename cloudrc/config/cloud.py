@@ -65,7 +65,7 @@ class Cloud(Section):
     """Mean of the emulated computing time of a command [ms]; or a CSV file with the column
     compute_ms or compute_s, of which each command takes a random row: `cloudrc measure compute`
     writes it. In real time, the true computing time is added. Cloud begins the next command only
-    after this time. Reports count this time as part of the downlink delay"""
+    after this time. It is a part of downlink_delay_mean and rtt_mean; the budget has it apart"""
     compute_deviation_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
     """Standard deviation of the time compute_ms [ms], which then has a gamma distribution; needs
     compute_ms above 0"""
