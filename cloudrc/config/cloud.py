@@ -33,11 +33,12 @@ class Cloud(Section):
     controller: PlugInChoice = "pid"
     """Tracks the setpoint: a name, or a mapping with parameters"""
     perception: PlugInChoice | None = None
-    """Makes setpoints of what the robot's scanner sees, while a mission flies: a name, or a mapping
-    with parameters. Teleop's waypoints then say only when the mission is over. null: none"""
+    """Makes setpoints of what the robot's scanner or camera sees, while a mission flies: a name, or
+    a mapping with parameters. Teleop's waypoints then say only when the mission is over. null:
+    none"""
     perception_ms: ComputeMs = 0.0
-    """Emulated computing time of perception for one scan [ms], as compute_ms. It has a core of its
-    own: commands do not wait for it, and scans that arrive meanwhile replace each other"""
+    """Emulated computing time of perception for one scan or picture [ms], as compute_ms. It has a
+    core of its own: commands do not wait for it, and what arrives meanwhile replaces each other"""
     plan_s: PlanTime = 0.0
     """Length of the plan in each command [s], with velocities in steps of 10 ms. The robot
     follows the plan while newer commands are late or lost. A plan needs a predictor with a model;

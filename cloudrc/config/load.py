@@ -106,7 +106,7 @@ def load_experiment(
             facts = facts_of(draft.world, guard.acceleration_max_mps2, guard.speed_max_mps)
         problems.raise_problems(document, found, name)
     if build and facts:
-        found += overrides.complete_plugins(document, draft.cloud, facts)
+        found += overrides.complete_plugins(document, draft, facts)
     else:
         overrides.name_plugins(document, draft.cloud)
     experiment = problems.validate(document, ResolvedExperiment, name, found, context=bounds)
@@ -221,12 +221,15 @@ def _without_effect(document: Document, experiment: ResolvedExperiment) -> Itera
 
 
 def _without_sensor(experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
-    """List the keys that need a scanner, if the robot has none."""
+    """List the keys that need a scanner or a camera, if the robot has none."""
     robot, perception = experiment.world.robot, experiment.cloud.perception
     if experiment.scans and known_robot(robot).scan is None:
         path = ("cloud", "perception") if perception else ("world", "scan")
         text = f"{robot} has no scanner: choose the rover, or give its robot.yaml the key scan"
         yield ConfigProblem(path, perception.name if perception else "true", text)
+    if experiment.camera is not None and known_robot(robot).camera is None:
+        text = f"{robot} has no camera: choose x2, or give its robot.yaml the key camera"
+        yield ConfigProblem(("camera",), experiment.camera.codec, text)
 
 
 def _check_mission(mission: MissionConfig, experiment: ResolvedExperiment) -> list[ConfigProblem]:

@@ -238,16 +238,19 @@ def name_plugins(document: Document, cloud: Cloud) -> dict[KeyPath, dict[str, An
     return made
 
 
-def complete_plugins(document: Document, cloud: Cloud, robot: RobotFacts) -> list[ConfigProblem]:
+def complete_plugins(
+    document: Document, draft: Experiment, robot: RobotFacts
+) -> list[ConfigProblem]:
     """Do as `name_plugins`, check the parameters, add defaults, and build each plug-in as a test.
 
     Return the problems.
     """
     found: list[ConfigProblem] = []
-    for path, plugin in name_plugins(document, cloud).items():
+    for path, plugin in name_plugins(document, draft.cloud).items():
         name, given = plugin["name"], {key: plugin[key] for key in plugin if key != "name"}
         try:
-            document.tree["cloud"][path[1]] |= _complete(document, path, name, given, cloud, robot)
+            values = _complete(document, path, name, given, draft, robot)
+            document.tree["cloud"][path[1]] |= values
         except ProblemsError as error:
             found += [each._replace(path=path + each.path) for each in error.problems]
         except BadInputError as error:
@@ -260,7 +263,7 @@ def _complete(
     path: KeyPath,
     name: str,
     given: dict[str, Any],
-    cloud: Cloud,
+    draft: Experiment,
     robot: RobotFacts,
 ) -> dict[str, Any]:
     """Check the parameters `given` to a plug-in, and add defaults, once for the points of a sweep.
@@ -268,18 +271,37 @@ def _complete(
     `path` is the key of the plug-in, such as ("cloud", "predictor"). Raise a BadInputError about a
     wrong parameter or a plug-in that fails.
     """
-    kind, plans = KINDS[path[1]], cloud.plan_s > 0
+    kind, plans = KINDS[path[1]], draft.cloud.plan_s > 0
+    # With a camera, the robot's scanner works if world.scan says so.
+    films, scans = draft.camera is not None, draft.camera is None or draft.world.scan
     for parameter, field in parameter_model(kind, name).model_fields.items():
         if field.annotation == Path | None and isinstance(given.get(parameter), str):
             given[parameter] = str(document.source((*path, parameter)).absolute(given[parameter]))
-    key = ("plug-in", kind, name, json.dumps(given), plans, repr(robot))
-    return reuse(key, lambda: _try(kind, name, given, robot, plans=plans))
+    key = ("plug-in", kind, name, json.dumps(given), plans, films, scans, repr(robot))
+    sensors = {"camera": films, "scan": scans}
+    return reuse(key, lambda: _try(kind, name, given, robot, sensors, plans=plans))
+
+
+SENSOR_MISSES = {
+    "camera": "takes pictures: give the experiment a section camera, such as camera: {codec: jpeg}",
+    "scan": "takes scans: set world.scan=true, or leave the section camera out",
+}
+"""Sensor that a perception takes -> what to do if it does not work."""
 
 
 def _try(
-    kind: str, name: str, given: dict[str, Any], robot: RobotFacts, *, plans: bool
+    kind: str,
+    name: str,
+    given: dict[str, Any],
+    robot: RobotFacts,
+    sensors: dict[str, bool],
+    *,
+    plans: bool,
 ) -> dict[str, Any]:
-    """Build a plug-in, with `plans` for a cloud that sends plans; return all its parameters."""
+    """Build a plug-in, with `plans` for a cloud that sends plans; return all its parameters.
+
+    `sensors` tells which sensors of the robot work.
+    """
     for parameter in given:
         if (kind, parameter) in GIVEN:
             raise BadInputError(f"{parameter}: is no parameter of yours, cloudrc gives it")
@@ -287,8 +309,11 @@ def _try(
     with code.calling(f"{plugins.one(kind)} {name!r} has a default that YAML cannot contain"):
         values: dict[str, Any] = checked.model_dump(mode="json")
     plugin = _build(kind, name, checked, {"robot": robot})
-    if kind == "perceptions" and plugin.takes != "scan":
-        raise BadInputError(f"'{name}' takes {plugin.takes!r}; robots send scans, takes = 'scan'")
+    if kind == "perceptions":
+        if plugin.takes not in sensors:
+            raise BadInputError(f"'{name}' takes {plugin.takes!r}; takes must be scan or camera")
+        if not sensors[plugin.takes]:
+            raise BadInputError(f"'{name}' {SENSOR_MISSES[plugin.takes]}")
     if plans and name in OUTSIDE:
         raise BadInputError(f"'{name}' cannot plan ahead; set cloud.plan_s to 0")
     if plans and kind == "predictors":

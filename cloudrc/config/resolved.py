@@ -149,8 +149,8 @@ class ResolvedExperiment(Experiment):
 
     @property
     def scans(self) -> bool:
-        """Whether the robot's scanner works."""
-        return self.world.scan or self.cloud.perception is not None
+        """Whether the robot's scanner works: with a camera, a perception looks at pictures."""
+        return self.world.scan or (self.cloud.perception is not None and self.camera is None)
 
     @model_validator(mode="after")
     def _refuse_faults(self) -> ResolvedExperiment:

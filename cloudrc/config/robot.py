@@ -121,6 +121,22 @@ class ScanConfig(Section):
     """Standard deviation of a distance, from a normal distribution [m]"""
 
 
+class CameraConfig(Section):
+    """A camera, whose pictures go to cloud."""
+
+    name: Annotated[str, Field(min_length=1)]
+    """Name of a camera of the model"""
+    width: Annotated[int, Field(ge=16, le=1920, multiple_of=2)] = 320
+    """Columns of a picture, an even number"""
+    height: Annotated[int, Field(ge=16, le=1080, multiple_of=2)] = 240
+    """Rows of a picture, an even number"""
+    fovy_deg: Annotated[float, Field(gt=0, lt=180)] = 45.0
+    """Angle from the lowest to the highest row [deg], fovy of the model's camera: cloud has no
+    model"""
+    fps: Annotated[int, Field(ge=1, le=100)] = 15
+    """Number of pictures per second [Hz]"""
+
+
 Sensors = Annotated[dict[SensorName, SensorConfig], Field(max_length=SENSORS_MAX)]
 
 
@@ -172,6 +188,9 @@ class RobotFiles(Section):
     scan: ScanConfig | None = None
     """The robot's scanner. It works only in an experiment that has cloud.perception or world.scan,
     and then sends its scans to cloud. null: the robot has none"""
+    camera: CameraConfig | None = None
+    """The robot's camera. It works only in an experiment with the section camera. null: the robot
+    has none"""
     hull_points: str | None = None
     """Python file with spheres in place of the ball of hull_m: its function `few` returns rows x,
     y, z, radius [m], body frame, for the distance from obstacles. null: there is none"""

@@ -328,6 +328,22 @@ class Link(Section):
         return self
 
 
+class CodecConfig(Section):
+    """How the pictures of the robot's camera travel to cloud."""
+
+    codec: Literal["jpeg", "h264"] = "jpeg"
+    """jpeg: each picture stands alone; h264: most hold what differs from the one before, so that
+    after a loss cloud waits for the next key frame. h264 needs the extra `camera`"""
+    quality: Annotated[int, Field(ge=1, le=95)] = 70
+    """Quality of JPEG, as Pillow counts it"""
+    kbit: Annotated[int, Field(ge=10, le=100_000)] = 800
+    """Mean and largest bit rate of H.264 [kbit/s]"""
+    key_every_s: Annotated[float, Field(ge=0.01, le=60)] = 1.0
+    """Time between two key frames of H.264 [s]"""
+    keep: bool = False
+    """Whether the recording holds the pictures that cloud had"""
+
+
 class Criteria(Section):
     """Conditions for the success of a flight."""
 
@@ -368,10 +384,18 @@ class Experiment(Section):
     link: Link = Link()
     cell: CellConfig = CellConfig()
     cloud: Cloud = Cloud()
+    camera: CodecConfig | None = None
+    """The robot's camera works, and how its pictures travel to cloud. null: it does not work"""
     fleet: FleetConfig = FleetConfig()
     criteria: Criteria = Criteria()
     report: Report = Report()
     faults: tuple[FaultConfig, ...] = ()
     """Faults that are injected in flight, in any order"""
 
-    _write = leave_out_unset("faults")
+    _write = leave_out_unset("faults", "camera")
+
+    @model_validator(mode="after")
+    def _refuse_fleet(self) -> Experiment:
+        if self.camera is not None and self.fleet.robots > 1:
+            raise ValueError("camera: works for one robot; a fleet of robots sends scans alone")
+        return self

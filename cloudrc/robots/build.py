@@ -28,7 +28,13 @@ from cloudrc.sim.airframe import thrust_to_weight
 from cloudrc.sim.energy import EnergyMeter, power_factors
 from cloudrc.sim.onboard import Accelerator, Actuators, Direct, Onboard
 from cloudrc.sim.plant import Wind
-from cloudrc.sim.scene import compile_model, compile_true, find_part, find_sensors
+from cloudrc.sim.scene import (
+    compile_model,
+    compile_true,
+    find_camera,
+    find_part,
+    find_sensors,
+)
 from cloudrc.sim.simulator import Simulator, rest_height
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.robot import STEP, Robot
@@ -85,6 +91,8 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
             find_part(nominal, "site", robot.probe, "probe")
         if robot.scan is not None:
             find_part(nominal, "site", robot.scan.site, "scan.site")
+        if robot.camera is not None:
+            find_camera(nominal, robot.camera)
     judges = not (is_direct or plugin.is_shipped)
     with plugin.calling("actuators" if judges else "build"):
         simulator = Simulator(model, actuators, wind, robot.probe, sensors, judges=judges)

@@ -24,7 +24,7 @@ from cloudrc.text import unknown_name_text
 
 if TYPE_CHECKING:
     from cloudrc.config.disturbances import Plant
-    from cloudrc.config.robot import SensorConfig
+    from cloudrc.config.robot import CameraConfig, SensorConfig
 
 ROBOT_PREFIX = "robot/"
 """Prefix of all names that belong to the robot in a compiled model."""
@@ -145,16 +145,31 @@ def bodies_of_geoms(model: Any) -> list[str]:
 
 
 def find_part(model: Any, kind: str, name: str, key: str) -> int:
-    """Return the number of the robot's `site` or `sensor` of a name, which `key` gives.
+    """Return the number of the robot's `site`, `sensor` or `camera` of a name, which `key` gives.
 
     Raises:
         ValueError: If the robot has no such part.
     """
-    names = [getattr(model, kind)(each).name for each in range(getattr(model, f"n{kind}"))]
+    count = model.ncam if kind == "camera" else getattr(model, f"n{kind}")
+    names = [getattr(model, kind)(each).name for each in range(count)]
     if f"{ROBOT_PREFIX}{name}" in names:
         return names.index(f"{ROBOT_PREFIX}{name}")
     own = [each.removeprefix(ROBOT_PREFIX) for each in names if each.startswith(ROBOT_PREFIX)]
     raise InvalidValueError(f"{key}: {unknown_name_text(f'{kind} of the model', name, own)}")
+
+
+def find_camera(model: Any, config: CameraConfig) -> int:
+    """Return the number of the robot's camera in a compiled `MjModel`; `config` is of robot.yaml.
+
+    Raises:
+        ValueError: If the robot has no such camera, or one with another field of view.
+    """
+    number = find_part(model, "camera", config.name, "camera.name")
+    fovy = float(model.cam_fovy[number])
+    if fovy != config.fovy_deg:
+        text = f"camera.fovy_deg is {config.fovy_deg:g}, but fovy of the model's camera is {fovy:g}"
+        raise InvalidValueError(text)
+    return number
 
 
 def find_sensors(model: Any, asked: Mapping[str, SensorConfig]) -> tuple[OwnSensor, ...]:

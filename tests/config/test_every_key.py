@@ -36,6 +36,7 @@ def test_every_key_is_described_and_dumped():
         "link.start_s",
         "cloud.answers",
         "faults",
+        "camera",
         "world.scan",
         "cloud.perception",
     ]  # left out where they have their default

@@ -9,7 +9,7 @@ returns a `Perception`; all parameters are annotated.
 from __future__ import annotations
 
 from math import cos, sin
-from typing import NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,16 @@ class Scan(NamedTuple):
     angles: NDArray[np.float64]  # of all rays [rad], shape (rays,); x ahead, rising to the left
 
 
-Seen: TypeAlias = Scan
+class Frame(NamedTuple):
+    """A picture that the robot's camera took, as its codec left it."""
+
+    stamp_ns: int  # time at which it was taken [ns], world's clock
+    number: int  # in the session, from 0 on
+    image: NDArray[np.uint8]  # red, green, blue, shape (height, width, 3); row 0 is the highest
+    fovy: float  # angle from the lowest to the highest row [rad]
+
+
+Seen: TypeAlias = Scan | Frame
 """What a perception gets."""
 
 
@@ -42,25 +51,25 @@ def point_at(odometry: Odometry, angle: float, distance: float) -> Vector:
 
 
 class Perception:
-    """Turns scans into setpoints; a plug-in has to define `see` only.
+    """Turns scans or pictures into setpoints; a plug-in has to define `see` only.
 
     Attributes:
-        takes: Sensor whose data `see` gets: "scan".
+        takes: Sensor whose data `see` gets: "scan", a `Scan`, or "camera", a `Frame`.
     """
 
-    takes = "scan"
+    takes: Literal["scan", "camera"] = "scan"
 
     def reset(self) -> None:
         """Forget everything at the start of a mission."""
 
-    def see(self, seen: Seen, odometry: Odometry) -> Setpoint | None:
+    def see(self, seen: Any, odometry: Odometry) -> Setpoint | None:
         """Return where the robot has to go, world frame; None: the last setpoint stays.
 
         Cloud brings the position into the fence. It flies to the setpoint as if teleop had given
         it; epoch, waypoint and motion of the result do not count.
 
         Args:
-            seen: The newest that has arrived.
+            seen: The newest `Scan` or `Frame` that has arrived, as `takes` says.
             odometry: Pose and twist as measured when `seen` was taken, or just before.
         """
         raise NotImplementedError
