@@ -48,6 +48,7 @@ from cloudrc.messages import Start
 from cloudrc.outside.code import apart
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.records import CONTROLLER_LOST, Fault
+from cloudrc.sensing import build_film, build_receiver, build_scanner
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.wire import Leg, Plan
 from cloudrc.tunnel.end import Identity
@@ -216,12 +217,16 @@ def flight_limit(experiment: ResolvedExperiment) -> float:
 
 
 def build_world(
-    experiment: ResolvedExperiment, identity: Identity, clock: Callable[[], int] = lambda: 0
+    experiment: ResolvedExperiment,
+    identity: Identity,
+    clock: Callable[[], int] = lambda: 0,
+    make_worker: Callable[[], Worker] | None = None,
 ) -> WorldEndpoint:
     """Build world: the robot in its scene, and world's end of the tunnel. Needs MuJoCo.
 
     `clock` returns the monotonic time [ns]. It is called last, at the start of world's time, so
-    that the duration of compiling the scene does not count.
+    that the duration of compiling the scene does not count. `make_worker` makes what renders
+    pictures beside world; None: they take no time.
     """
     from cloudrc.robots.build import build_robot
     from cloudrc.sim.plant import Wind
@@ -234,13 +239,7 @@ def build_world(
         for name in ("odometry noise", "attitude noise", "wind")
     )
     wind = Wind(world.wind, air) if world.wind.blows else None
-    robot, scanner = build_robot(world, experiment.guard, wind), None
-    scan = known_robot(world.robot).scan
-    if experiment.scans and scan is not None:
-        from cloudrc.sim.scan import Scanner
-
-        errors = generator(seed, "scan noise", experiment.stream)
-        scanner = Scanner(robot.simulator.model, robot.simulator.data, scan, errors)
+    robot = build_robot(world, experiment.guard, wind)
     return WorldEndpoint(
         robot,
         Sensors(world.sensors, noise, turn_noise),
@@ -248,7 +247,8 @@ def build_world(
         newest_wins=experiment.tunnel.order == "newest",
         odometry_period_ns=SECOND_NS // world.odometry_rate_hz,
         start_ns=clock(),
-        scanner=scanner,
+        scanner=build_scanner(experiment, robot, generator(seed, "scan noise", experiment.stream)),
+        film=build_film(experiment, robot, make_worker),
     )
 
 
@@ -291,6 +291,7 @@ def build_cloud(
         newest_wins=experiment.tunnel.order == "newest",
         compute=compute,
         perceiver=_build_perceiver(experiment, loop, make_worker, measured),
+        frames=build_receiver(experiment),
         start_ns=clock(),
         on_arrival=cloud.answers == "arrival",
     )
@@ -320,14 +321,15 @@ def _build_perceiver(
     make_worker: Callable[[ComputeTime | None], Worker],
     cpu_clock: Callable[[], int] | None,
 ) -> Perceiver | None:
-    """Build what steers by the robot's scans; None without a perception."""
+    """Build what steers by what the robot sees; None without a perception."""
     cloud, scan = experiment.cloud, known_robot(experiment.world.robot).scan
-    if cloud.perception is None or scan is None:
+    if cloud.perception is None:
         return None
     perception = build_plugin("perceptions", cloud.perception, robot=_facts_of(experiment))
     draws = generator(experiment.seed, "perception time", experiment.stream)
     worker = make_worker(compute_time(cloud, cloud.perception_ms, draws, cpu_clock))
-    fence, angles = steered_in(experiment.world), angles_of(scan.rays, scan.fov_deg)
+    angles = angles_of(scan.rays, scan.fov_deg) if scan else np.empty(0)
+    fence = steered_in(experiment.world)
     return Perceiver(perception, worker, fence, angles, partial(loop.note_failure, "perception"))
 
 

@@ -157,6 +157,21 @@ class RangeScan(NamedTuple):
     millimetres: tuple[int, ...]  # a distance per ray, from right to left; 0: nothing within range
 
 
+PIECE_MAX = 1151
+"""Largest piece of a picture: with header and tag its datagram has 1,200 bytes [bytes]."""
+
+
+class FramePiece(NamedTuple):
+    """Message from world to cloud: a piece of a picture of the robot's camera, as it is encoded."""
+
+    stamp_ns: int  # time at which the picture was taken [ns], world's clock
+    number: int  # of the picture in its session, from 0 on
+    piece: int  # of the picture, from 0 on
+    pieces: int  # of which the picture consists
+    key: bool  # whether the picture needs none before it
+    data: bytes
+
+
 PLAN_STEP_NS = 10_000_000
 """Time between two velocities of a plan [ns]."""
 

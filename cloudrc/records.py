@@ -169,6 +169,42 @@ class ScanTaken(NamedTuple):
     ranges: Annotated[Numbers, "m", "of all rays, as measured; inf: nothing within range"]
 
 
+class FrameSent(NamedTuple):
+    """Made by world: a picture of the robot's camera was sent. Topic /frame.
+
+    Its stamp is when its pieces were sent. In virtual time, rendering and encoding take no time.
+    """
+
+    stamp_ns: int
+    epoch: Epoch
+    number: Annotated[int, "", "of the picture in its session"]
+    taken_ns: Annotated[int, "ns", "time at which it was taken, world's clock"]
+    encode_ns: Annotated[int, "ns", "duration of rendering and encoding it"]
+    counter: Annotated[int, "", "counter of its first datagram, one for each piece"]
+    pieces: Annotated[int, "", "number of its datagrams"]
+    size: Annotated[int, "bytes", "of the encoded picture"]
+    key: Annotated[bool, "", "true if it needs no picture before it"]
+    psnr: Annotated[float, "dB", "peak signal-to-noise ratio of the decoded picture"]
+
+
+class FrameShown(NamedTuple):
+    """Made by cloud: a picture was there with all that it needs. Topic /frame_shown."""
+
+    stamp_ns: int
+    epoch: Epoch
+    number: Annotated[int, "", "of the picture in its session"]
+    taken_ns: Annotated[int, "ns", "time at which it was taken, world's clock"]
+    wait_ns: Annotated[int, "ns", "from the arrival of its last piece until the stamp of the row"]
+
+
+class FrameKept(NamedTuple):
+    """Made by cloud: a picture as cloud has it, if the experiment keeps them. Topic /camera."""
+
+    stamp_ns: int  # time at which it was taken [ns], world's clock
+    format: Annotated[str, "", "jpeg as it arrived; png: decoded from H.264"]
+    data: Annotated[bytes, "", "the file"]
+
+
 class Arrival(NamedTuple):
     """Made by world or cloud: a datagram with a command or telemetry arrived, even if late.
 
@@ -301,14 +337,14 @@ class LinkWait(NamedTuple):
 
 
 class Perceived(NamedTuple):
-    """Made by cloud: what became of a scan that the perception has looked at. Topic /perception.
+    """Made by cloud: what became of a scan or picture that the perception saw. Topic /perception.
 
     Cloud makes the record with the first command from the perception's setpoint, or when nothing
-    can follow any more. The durations lead back from the stamp to the arrival of the scan.
+    can follow any more. The durations lead back from the stamp to the arrival of what was seen.
     """
 
     stamp_ns: int
-    seen_stamp_ns: Annotated[int, "ns", "stamp of the scan, world's clock"]
+    seen_stamp_ns: Annotated[int, "ns", "stamp of the scan or picture, world's clock"]
     wait_ns: Annotated[int, "ns", "from its arrival until the perception began with it"]
     compute_ns: Annotated[int, "ns", "from there until the perception was done"]
     hold_ns: Annotated[int, "ns", "from there until the stamp of the row"]
@@ -423,6 +459,6 @@ Record: TypeAlias = (
     (TelemetrySent | GroundTruth | ContactForce | SensorRead | Arrival | CommandApplied)
     | (EnergyUsed | Left | CellWait | LinkWait)
     | (GuardChange | Contact | SessionOpened | Control | PlanFollowed | MissionEvent)
-    | (ScanTaken | Perceived)
+    | (ScanTaken | Perceived | FrameSent | FrameShown | FrameKept)
     | (Fault | Counted | LinkChanged | LinkChecked | Lateness)
 )

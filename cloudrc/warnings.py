@@ -95,6 +95,9 @@ def _low_rates(experiment: ResolvedExperiment) -> Iterator[str]:
         needed = (size + HEADER_BYTES) * 8.0 * rate
         if scan is not None and name == "uplink":
             needed += (SCAN_SIZES[scan.rays] + HEADER_BYTES) * 8.0 * scan.rate_hz
+        if name == "uplink" and experiment.camera is not None:
+            # Of JPEG the size is not known before.
+            needed += experiment.camera.kbit * 1e3 if experiment.camera.codec == "h264" else 0.0
         if doubt := describe_low_rate(getattr(experiment, name), name, needed, what):
             yield doubt
 

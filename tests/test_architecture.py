@@ -30,6 +30,8 @@ ASKED_AS = {
     **dict.fromkeys(("pydantic_core", "annotated_types"), "pydantic"),
     "urllib3": "kubernetes",
     "foxglove": "foxglove_sdk",
+    "PIL": "pillow",
+    "OpenGL": "pyopengl",
 }
 
 

@@ -76,7 +76,10 @@ _STAMPS = {
         "/estimated_odometry /setpoint_position /cmd_vel /delay_estimate /pid",
     ("physics step at which the scan is taken", "`rate_hz` of the scanner, in a session"): "/scan",
     ("first command from the perception's setpoint; without one, when that is known",
-     "once per scan that the perception has looked at"): "/perception",
+     "once per scan or picture that the perception has looked at"): "/perception",
+    ("when world sends the picture", "`fps` of the camera, in a session"): "/frame",
+    ("when cloud has the picture and all that it needs", "once per picture that cloud shows"):
+        "/frame_shown /camera",
     ("arrival of the telemetry at cloud", "once per telemetry while the robot follows a plan"):
         "/plan",
     ("departure of the command", "once per command whose computation takes simulated time"):

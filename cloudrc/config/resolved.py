@@ -153,6 +153,12 @@ class ResolvedExperiment(Experiment):
         return self.world.scan or (self.cloud.perception is not None and self.camera is None)
 
     @model_validator(mode="after")
+    def _refuse_fleet(self) -> ResolvedExperiment:
+        if self.camera is not None and self.fleet.robots > 1:
+            raise ValueError("camera: works for one robot; a fleet of robots sends scans alone")
+        return self
+
+    @model_validator(mode="after")
     def _refuse_faults(self) -> ResolvedExperiment:
         link = self.link
         goes_round = link.start_s == RANDOM

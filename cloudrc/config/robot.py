@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from cloudrc.config import shipped
+from cloudrc.config.camera import CameraConfig
 from cloudrc.config.choice import PlugIn
 from cloudrc.config.heading import Heading
 from cloudrc.config.problems import validate
@@ -119,22 +120,6 @@ class ScanConfig(Section):
     """Number of scans per second [Hz]"""
     noise_m: Annotated[float, Field(ge=0, le=1)] = 0.01
     """Standard deviation of a distance, from a normal distribution [m]"""
-
-
-class CameraConfig(Section):
-    """A camera, whose pictures go to cloud."""
-
-    name: Annotated[str, Field(min_length=1)]
-    """Name of a camera of the model"""
-    width: Annotated[int, Field(ge=16, le=1920, multiple_of=2)] = 320
-    """Columns of a picture, an even number"""
-    height: Annotated[int, Field(ge=16, le=1080, multiple_of=2)] = 240
-    """Rows of a picture, an even number"""
-    fovy_deg: Annotated[float, Field(gt=0, lt=180)] = 45.0
-    """Angle from the lowest to the highest row [deg], fovy of the model's camera: cloud has no
-    model"""
-    fps: Annotated[int, Field(ge=1, le=100)] = 15
-    """Number of pictures per second [Hz]"""
 
 
 Sensors = Annotated[dict[SensorName, SensorConfig], Field(max_length=SENSORS_MAX)]

@@ -23,6 +23,7 @@ from pydantic import (
     model_validator,
 )
 
+from cloudrc.config.camera import CodecConfig
 from cloudrc.config.choice import NameOr
 from cloudrc.config.cloud import Cloud
 from cloudrc.config.disturbances import Plant, SensorsConfig, WindConfig
@@ -328,22 +329,6 @@ class Link(Section):
         return self
 
 
-class CodecConfig(Section):
-    """How the pictures of the robot's camera travel to cloud."""
-
-    codec: Literal["jpeg", "h264"] = "jpeg"
-    """jpeg: each picture stands alone; h264: most hold what differs from the one before, so that
-    after a loss cloud waits for the next key frame. h264 needs the extra `camera`"""
-    quality: Annotated[int, Field(ge=1, le=95)] = 70
-    """Quality of JPEG, as Pillow counts it"""
-    kbit: Annotated[int, Field(ge=10, le=100_000)] = 800
-    """Mean and largest bit rate of H.264 [kbit/s]"""
-    key_every_s: Annotated[float, Field(ge=0.01, le=60)] = 1.0
-    """Time between two key frames of H.264 [s]"""
-    keep: bool = False
-    """Whether the recording holds the pictures that cloud had"""
-
-
 class Criteria(Section):
     """Conditions for the success of a flight."""
 
@@ -393,9 +378,3 @@ class Experiment(Section):
     """Faults that are injected in flight, in any order"""
 
     _write = leave_out_unset("faults", "camera")
-
-    @model_validator(mode="after")
-    def _refuse_fleet(self) -> Experiment:
-        if self.camera is not None and self.fleet.robots > 1:
-            raise ValueError("camera: works for one robot; a fleet of robots sends scans alone")
-        return self

@@ -207,6 +207,9 @@ _TABLE = (
     LiveMetric((WORLD,), COUNTER, "cloudrc_world_stalls_total",
                "Times that world woke so late that the waiting datagrams were stale.",
                counted="stalls"),
+    LiveMetric((WORLD,), COUNTER, "cloudrc_camera_late_total",
+               "Pictures that were not taken, because the one before was still being rendered.",
+               counted="frames_late"),
     *_of_quantities(WORLD),
     LiveMetric((CLOUD,), HISTOGRAM, "cloudrc_uplink_delay_seconds",
                "One-way delay from world to cloud, late datagrams included; absent unless both "

@@ -24,6 +24,8 @@ QUANTUM = 1500
 Source: M. Shreedhar, G. Varghese, "Efficient fair queueing using deficit round robin", 1995."""
 FRAME_NS, VIDEO_BYTES = 33_333_333, 1228
 """Time between two frames of a video [ns], and size of its packets with headers [bytes]."""
+PICTURE = 10
+"""Kind of the packets with pieces of a robot's pictures, `tunnel.codec.Kind.FRAME`."""
 BULK_BYTES, ROUND_TRIP_NS, WINDOW_MAX = 1500, 40_000_000, 2000.0
 """Size of a packet of a bulk flow with headers [bytes]; time from its departure to its confirmation
 [ns]; largest number of its packets under way."""
@@ -156,7 +158,7 @@ class Cell:
         """Let a packet wait; return False if it is dropped, because the queue is full."""
         flow, lane = packet.flow, self._lane(packet)
         waiting, dropped = self._lanes.setdefault(lane, {}), self.usage.dropped
-        is_newest = self._queue == "newest" and flow >= 0
+        is_newest = self._queue == "newest" and flow >= 0 and packet.kind != PICTURE
         place = (flow, packet.kind, packet.way) if is_newest else (flow, packet.number)
         takes_place = place in waiting  # of an older packet
         is_full = not is_newest and len(waiting) + self._is_serving(lane) >= self._packets_max
@@ -177,7 +179,8 @@ class Cell:
         """Return the number of the queue in which a packet waits; lower ones leave first."""
         if self._queue == "drr":
             return packet.flow
-        return int(self._queue == "priority" and packet.flow < 0)
+        is_other = packet.flow < 0 or packet.kind == PICTURE
+        return int(self._queue == "priority" and is_other)
 
     def _is_serving(self, lane: int) -> bool:
         return self._serving is not None and self._lane(self._serving) == lane

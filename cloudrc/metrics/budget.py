@@ -300,14 +300,19 @@ def _scans_of(flight: Flight, method: str) -> Budget | None:
     begun_ns = done_ns - seen["compute_ns"]
     arrived_ns = begun_ns - seen["wait_ns"]
     made = [each.name for each in STAGES].index("queue") + 1
+    sent, stamps_ns = flight.recording["/frame"], seen["seen_stamp_ns"]
+    pictures, rows = join(stamps_ns, sent["taken_ns"])
+    sent_ns = np.full(len(stamps_ns), UNKNOWN_NS)
+    sent_ns[pictures] = sent["stamp_ns"][rows]
     stages = (
+        _stage("frame_encode", lambda _: sent_ns, is_extra=True),
         _stage("scan_uplink", lambda _: arrived_ns, at_cloud=True),
         _stage("scan_wait", lambda _: begun_ns, at_cloud=True),
         _stage("scan_compute", lambda _: done_ns, at_cloud=True),
         _stage("scan_hold", lambda c: c.at("/delay_estimate", c.numbers), at_cloud=True),
         *STAGES[made:],
     )
-    commands = Commands(flight, numbers, seen["seen_stamp_ns"])
+    commands = Commands(flight, numbers, stamps_ns)
     found = _cut(stages, commands, len(numbers), method)
     return found._replace(numbers=numbers, ended=np.full(len(numbers), ""))
 

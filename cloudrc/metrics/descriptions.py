@@ -50,12 +50,13 @@ AGE_STAGES = {
 }
 """Stages of the age of a command, in their order -> in words."""
 SCAN_STAGES = {
-    "scan_uplink": "uplink of the scan",
-    "scan_wait": "scan waits for the perception",
+    "frame_encode": "picture is rendered and encoded",
+    "scan_uplink": "uplink of the scan or picture",
+    "scan_wait": "scan or picture waits for the perception",
     "scan_compute": "perception computes",
     "scan_hold": "setpoint waits for its command",
 }
-"""Stages from a scan to the first command for it, in their order -> in words."""
+"""Stages from a scan or picture to the first command for it, in their order -> in words."""
 DESCRIPTIONS: dict[str, Description] = {}
 """Name in report.json -> description."""
 
@@ -201,11 +202,21 @@ _add(
 )  # fmt: skip
 _add(
     "Perception",
-    ("seen_to_acted", "s", "Mean time from a scan until the robot acts on it: uplink, perception, "
-     "command and downlink."),
-    ("seen_to_acted_p99", "s", "99th percentile of the time from a scan until the robot acts on "
-     "it."),
-    ("seen_dropped", "1", "Number of scans in whose place the perception took newer ones."),
+    ("seen_to_acted", "s", "Mean time from a scan or picture until the robot acts on it: uplink, "
+     "perception, command and downlink."),
+    ("seen_to_acted_p99", "s", "99th percentile of the time from a scan or picture until the robot "
+     "acts on it."),
+    ("seen_dropped", "1", "Number of scans or pictures in whose place the perception took newer "
+     "ones."),
+    ("frame_age_mean", "s", "Age of the newest picture that cloud has, mean over time."),
+    ("frame_age_p99", "s", "Age of the newest picture that cloud has, 99th percentile over time."),
+    ("frame_age_max", "s", "Age of the newest picture that cloud has, largest."),
+    ("frames_shown", "1", "Share of the pictures sent that cloud could show."),
+    ("frame_psnr", "dB", "Peak signal-to-noise ratio of the pictures shown, as the codec leaves "
+     "them, mean."),
+    ("video_kbit", "kbit/s", "Mean bit rate of the encoded pictures, without headers."),
+    ("frames_late", "1", "Number of pictures that world did not take, because the one before was "
+     "still being rendered. In real time only."),
     *((f"budget_{_stage}", "s", f"Mean of a stage of seen_to_acted: {_words}.")
       for _stage, _words in SCAN_STAGES.items()),
 )  # fmt: skip

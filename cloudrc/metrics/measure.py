@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from cloudrc import plugins
 from cloudrc.errors import describe_error
-from cloudrc.metrics import budget, control, link, mission, perception, response
+from cloudrc.metrics import budget, camera, control, link, mission, perception, response
 from cloudrc.metrics.flight import SHIPPED, Flight, Metric, add_quantities
 from cloudrc.outside import code
 from cloudrc.outside.patience import telling_if_slow
@@ -23,7 +23,7 @@ from cloudrc.record.holes import goes_on
 # The imported modules add the metrics of cloudrc to SHIPPED.
 add_quantities()
 __all__ = ["SHIPPED", "Flight", "Metric"]
-__all__ += ["budget", "control", "link", "mission", "perception", "response"]
+__all__ += ["budget", "camera", "control", "link", "mission", "perception", "response"]
 
 METRIC_NOTE = "metric "
 """Beginning of a note about a metric."""
@@ -41,6 +41,7 @@ IN_SPITE_OF_HOLES = {
     "late_downlink",
     "age_of_information_mean",
     "seen_to_acted",
+    "frame_psnr",
     "prediction_error_rms",
     "estimate_error_rms",
     "delay_estimate_error_rms",

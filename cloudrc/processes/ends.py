@@ -79,7 +79,7 @@ class EndSettings:
 def run_world(settings: EndSettings, stop: StopSignal) -> None:
     """Run world until `stop`."""
     experiment, identity, end = open_end(settings, "world")
-    world = assembly.build_world(experiment, identity, time.monotonic_ns)
+    world = assembly.build_world(experiment, identity, time.monotonic_ns, lambda: Background(None))
     end.run(world, stop, lambda: world.robot.guard.armed, lambda: world.slip_ns)
 
 

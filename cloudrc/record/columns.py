@@ -42,6 +42,7 @@ _TYPES: dict[Kind, tuple[type, tuple[int, ...]]] = {
     "vector": (np.float64, (3,)),
     "quaternion": (np.float64, (4,)),
     "floats": (np.float64, ()),  # the rows say how many
+    "bytes": (np.object_, ()),
 }
 
 
@@ -147,8 +148,11 @@ class Recording(Content):
             for name, values in table.columns.items():
                 column = values[rows]
                 if column.dtype == object:
-                    known = {text: text.encode("utf-8", "replace") for text in {*column}}
-                    total.update(repr([known[text] for text in column]).encode())
+                    known = {
+                        each: each.encode("utf-8", "replace") if isinstance(each, str) else each
+                        for each in {*column}
+                    }
+                    total.update(repr([known[each] for each in column]).encode())
                 elif (topic.ros_type, name) != ROTATED:
                     total.update(column.data)
         return total.hexdigest()

@@ -4,8 +4,8 @@
 
 ROS stores quaternions as `xyzw` and the velocity of an odometry in the body frame; cloudrc uses
 `wxyz` and the world frame. Only this module converts between them. Every message begins with a
-`std_msgs/Header`, which contains the row's stamp; the frames are `world`, `base_link` and
-`lidar`.
+`std_msgs/Header`, which contains the row's stamp; the frames are `world`, `base_link`, `lidar` and
+`camera`.
 
 The message types in `cloudrc_msgs` are generated from `cloudrc/record/topics.py`, with a comment
 and a unit for each field. All other types are standard ROS types. The package rosbags parses,
@@ -31,6 +31,8 @@ from cloudrc.record.topics import TOPICS, Kind, Row, Topic, Values
 _OURS = "cloudrc_msgs/"
 SCAN, LIDAR = "sensor_msgs/msg/LaserScan", "lidar"
 """Type of a scan, and its frame, that of the scanner."""
+PICTURE, CAMERA = "sensor_msgs/msg/CompressedImage", "camera"
+"""Type of a picture, and its frame, that of the camera."""
 _ROS_NAMES: dict[Kind, str] = {
     "int": "int64",
     "float": "float64",
@@ -214,6 +216,7 @@ _PARSERS: dict[str, _Parse] = {
     "geometry_msgs/msg/TwistStamped": lambda message: twist_of(message.twist),
     "geometry_msgs/msg/PointStamped": lambda message: (_xyz(message.point),),
     SCAN: _parse_scan,
+    PICTURE: lambda picture: (picture.format, picture.data.tobytes()),
 }
 """Standard ROS type -> function to decode it; a topic may use only its first fields."""
 
@@ -264,6 +267,8 @@ def _packer(topic: Topic) -> Callable[[Row], bytes] | None:
     kinds = [field.kind for field in topic.fields]
     if topic.ros_type == SCAN:
         return pack_scan
+    if topic.ros_type == PICTURE:
+        return pack_picture
     if "string" in kinds:
         return None
     layout, numbers = _FIXED.get(topic.ros_type) or (_layout(kinds), partial(_numbers, kinds))
@@ -279,6 +284,12 @@ def pack_scan(row: Row, frame: str = LIDAR) -> bytes:
     angles = angle_min, angle_min + step * (len(ranges) - 1), step
     arrays = np.float32(ranges), np.empty(0, np.float32)  # intensities: none
     return pack(SCAN, header(stamp_ns, frame), *angles, 0.0, period, 0.0, range_max, *arrays)
+
+
+def pack_picture(row: Row) -> bytes:
+    """Encode a row of /camera as a sensor_msgs/CompressedImage."""
+    stamp_ns, form, data = row
+    return pack(PICTURE, header(stamp_ns, CAMERA), form, np.frombuffer(data, np.uint8))
 
 
 def _layout(kinds: Iterable[Kind]) -> str:

@@ -28,7 +28,9 @@ from cloudrc import records as rec
 from cloudrc.messages import Cause, GuardState, Quaternion, Vector
 from cloudrc.records import Record
 
-Kind: TypeAlias = Literal["int", "float", "bool", "string", "vector", "quaternion", "floats"]
+Kind: TypeAlias = Literal[
+    "int", "float", "bool", "string", "vector", "quaternion", "floats", "bytes"
+]
 Values: TypeAlias = tuple[Any, ...]
 Row: TypeAlias = tuple[Any, ...]
 """Stamp [ns] on the clock of the recording end (world or cloud), then the values of the fields."""
@@ -98,6 +100,7 @@ _KINDS: dict[Any, Kind] = {
     Vector: "vector",
     Quaternion: "quaternion",
     rec.Numbers: "floats",
+    bytes: "bytes",
 }
 
 
@@ -172,7 +175,14 @@ _TABLE = (
         "Where a datagram waits in the link, world's clock. Only in virtual time, with a rate or a"
         " radio"),
     Topic("/perception", "cloudrc_msgs/msg/Perceived", rec.Perceived, "cloud",
-        "What became of a scan at cloud's perception, cloud's clock"),
+        "What became of a scan or picture at cloud's perception, cloud's clock"),
+    Topic("/frame", "cloudrc_msgs/msg/FrameSent", rec.FrameSent, "world",
+        "A picture of the robot's camera was sent, world's clock"),
+    Topic("/frame_shown", "cloudrc_msgs/msg/FrameShown", rec.FrameShown, "cloud",
+        "A picture was there with all that it needs, cloud's clock"),
+    Topic("/camera", "sensor_msgs/msg/CompressedImage", rec.FrameKept, "cloud",
+        "A picture as cloud had it, cloud's clock: a row for each of /frame_shown. Only with"
+        " camera.keep"),
     Topic("/mission", "cloudrc_msgs/msg/MissionEvent", rec.MissionEvent, "cloud",
         "An event of the mission, cloud's clock"),
     Topic("/fault", "cloudrc_msgs/msg/Fault", rec.Fault, "either",
@@ -193,7 +203,7 @@ _TABLE = (
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 """Name -> topic, for every topic of a recording."""
 
-ADDED = ("/plan", "/sensor", "/scan", "/perception")
+ADDED = ("/plan", "/sensor", "/scan", "/perception", "/frame", "/frame_shown", "/camera")
 """Topics that came later than the others; without rows they do not change a hash."""
 UNHASHED = ("/energy", "/left", "/cell_wait", "/link_wait")
 """Topics that never change a hash: flights from before them keep theirs."""

@@ -51,6 +51,7 @@ class Run:
     interrupted: bool = False  # whether the user stopped the run
     notes: tuple[str, ...] = ()  # sentences for the reader of the report
     physics_steps: str = ""  # code of the physics steps, such as "C (compiled by cc)"; "": unknown
+    camera: Mapping[str, str] | None = None  # what renders and encodes its pictures
     # Dotted key of each of the user's files -> hash of its content before the flight.
     files: Mapping[str, str] = field(default_factory=dict)
 
@@ -122,13 +123,16 @@ def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
 
 
 def environment_document(
-    physics_steps: str = "", code: str | None = None, files: Mapping[str, str] | None = None
+    physics_steps: str = "",
+    code: str | None = None,
+    files: Mapping[str, str] | None = None,
+    camera: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Describe the software and hardware of this machine, without names of users and hosts.
 
     `physics_steps` names the code of the physics steps, such as "C (compiled by cc)"; "" if this is
     unknown. `code` is a hash of the sources that have flown; None if this is unknown. `files` are
-    the hashes of the user's files, by key.
+    the hashes of the user's files, by key. `camera` names what renders and encodes pictures.
     """
     document = {
         "schemaVersion": SCHEMA_VERSION,
@@ -140,6 +144,7 @@ def environment_document(
         "cores": os.cpu_count(),
         "code": code,
         "physics_steps": physics_steps or None,
+        "camera": camera,
         FILES: files or None,
     }
     return _known(document)

@@ -142,7 +142,7 @@ def _environment(path: Path, assessment: Assessment) -> dict[str, Any]:
     if not path.is_symlink() and (known := read_json(path)):
         return known
     run = assessment.run
-    document = environment_document(run.physics_steps, assessment.code, run.files)
+    document = environment_document(run.physics_steps, assessment.code, run.files, run.camera)
     write_json(path, document)
     return document
 

@@ -20,6 +20,7 @@ from cloudrc.drivers.machine import usable_cores
 from cloudrc.metrics import measure
 from cloudrc.outside.reuse import reuse
 from cloudrc.runs.requirements import require
+from cloudrc.sensing import describe_camera
 from cloudrc.warnings import advise
 
 CORES_OF_ROBOT, CORES_LEFT = 0.22, 0.2
@@ -107,6 +108,8 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
     if mode != "virtual" and (experiment.cloud.clock_offset_s or experiment.cloud.clock_drift_ppm):
         text = "acts, as clock_drift_ppm, in virtual time only; use --mode virtual, or leave it out"
         raise problem_at("cloud.clock_offset_s", text)
+    if mode != "cluster":
+        describe_camera(experiment)  # else it says what this machine lacks
     if mode != "virtual" and experiment.fleet.robots > 1:
         check_unshared(experiment.cloud)
     if (controller := experiment.cloud.controller.name) in OUTSIDE:

@@ -35,6 +35,7 @@ from cloudrc.report.write import attachments, write_report
 from cloudrc.runs.interrupts import raise_if_interrupted
 from cloudrc.runs.own_files import hash_files
 from cloudrc.runs.session import read_last_mission
+from cloudrc.sensing import describe_camera
 
 See: TypeAlias = Callable[[list[Record]], None]
 """Function that gets records during the flight."""
@@ -204,7 +205,8 @@ def _describe(
 
     every = (*notes, *([str(error)] if error else ()))
     shaper = "relay" if mode == "local" else mode
-    return Run(mode, shaper, interrupted, every, describe_steps(experiment.world))
+    steps, camera = describe_steps(experiment.world), describe_camera(experiment)
+    return Run(mode, shaper, interrupted, every, steps, camera)
 
 
 def _raise_if_lost(records: list[Record]) -> None:

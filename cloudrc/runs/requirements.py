@@ -21,6 +21,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "foxglove": ("foxglove",),
     "mpc": ("daqp",),
     "bucket": ("s3fs",),
+    "camera": ("av",),
 }
 """Name of an extra in pyproject.toml -> the modules that it installs."""
 PACKAGES = {"foxglove": "foxglove-sdk"}

@@ -23,8 +23,9 @@ from cloudrc.sim.plant import Array, Inertia, point_inertia, true_inertia
 from cloudrc.text import unknown_name_text
 
 if TYPE_CHECKING:
+    from cloudrc.config.camera import CameraConfig
     from cloudrc.config.disturbances import Plant
-    from cloudrc.config.robot import CameraConfig, SensorConfig
+    from cloudrc.config.robot import SensorConfig
 
 ROBOT_PREFIX = "robot/"
 """Prefix of all names that belong to the robot in a compiled model."""

@@ -18,12 +18,14 @@ from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.messages import (
     NEVER_NS,
+    PIECE_MAX,
     RAYS_MAX,
     SENSORS_MAX,
     TOUCH_NAME_MAX,
     Cause,
     Command,
     Datagram,
+    FramePiece,
     GuardState,
     Odometry,
     OperatorRequest,
@@ -57,6 +59,7 @@ class Kind(IntEnum):
     OPERATOR = 7
     ALIVE = 8
     SCAN = 9
+    FRAME = 10
 
 
 class Direction(IntEnum):
@@ -103,9 +106,10 @@ _BODIES = {
     Kind.OPERATOR: struct.Struct("<IBBQHq"),
     Kind.ALIVE: struct.Struct(""),
     Kind.SCAN: struct.Struct("<q"),
+    Kind.FRAME: struct.Struct("<qIHHB"),
 }
 _TELEMETRY, _COMMAND = _BODIES[Kind.TELEMETRY], _BODIES[Kind.COMMAND]
-_OPERATOR, _SCAN = _BODIES[Kind.OPERATOR], _BODIES[Kind.SCAN]
+_OPERATOR, _SCAN, _FRAME = _BODIES[Kind.OPERATOR], _BODIES[Kind.SCAN], _BODIES[Kind.FRAME]
 BODY_SIZES = {kind: body.size for kind, body in _BODIES.items()}
 LAST_GREETING = int(Kind.BUSY)
 HEADER_SIZE, TAG_SIZE = _HEADER.size, 16
@@ -129,6 +133,7 @@ _sizes_of: dict[int, Container[int]] = {
     int(Kind.TELEMETRY): frozenset(TELEMETRY_SIZES),
     int(Kind.COMMAND): frozenset(COMMAND_SIZES),
     int(Kind.SCAN): frozenset(SCAN_SIZES),
+    int(Kind.FRAME): range(SIZES[Kind.FRAME] + 1, SIZES[Kind.FRAME] + PIECE_MAX + 1),
     int(Kind.OPERATOR): range(SIZES[Kind.OPERATOR], SIZES[Kind.OPERATOR] + TOUCH_NAME_MAX + 1),
 }
 """Kind -> valid sizes of its datagrams [bytes]."""
@@ -246,6 +251,20 @@ def decode_scan(body: bytes) -> RangeScan:
     """Decode the body of a SCAN datagram."""
     stamp_ns, *millimetres = struct.unpack(f"<q{(len(body) - _SCAN.size) // 2}H", body)
     return RangeScan(stamp_ns, tuple(millimetres))
+
+
+def encode_piece(piece: FramePiece) -> bytes:
+    """Encode the body of a FRAME datagram."""
+    *fields, data = piece
+    return _FRAME.pack(*fields) + data
+
+
+def decode_piece(body: bytes) -> FramePiece:
+    """Decode the body of a FRAME datagram."""
+    stamp_ns, number, piece, pieces, key = _FRAME.unpack_from(body)
+    if piece >= pieces or key > 1:
+        raise DecodeError("malformed")
+    return FramePiece(stamp_ns, number, piece, pieces, bool(key), body[_FRAME.size :])
 
 
 def encode_operator(request: OperatorRequest) -> bytes:

@@ -9,11 +9,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from cloudrc.messages import Command, Datagram, Passed, RangeScan, Telemetry
+from cloudrc.messages import Command, Datagram, FramePiece, Passed, RangeScan, Telemetry
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import ReceiveWindow
-from cloudrc.tunnel.codec import Direction, encode_command, encode_scan, encode_telemetry
+from cloudrc.tunnel.codec import (
+    Direction,
+    encode_command,
+    encode_piece,
+    encode_scan,
+    encode_telemetry,
+)
 from cloudrc.tunnel.handshake import KEY_TEXT, VERSION_TEXT
 from cloudrc.tunnel.keys import KeyRing
 from cloudrc.tunnel.session import Session
@@ -22,6 +28,7 @@ _ENCODERS: dict[type, Callable[[Any], bytes]] = {
     Telemetry: encode_telemetry,
     Command: encode_command,
     RangeScan: encode_scan,
+    FramePiece: encode_piece,
 }
 
 
@@ -96,7 +103,7 @@ class TunnelEnd:
     def _send(self, kind: int, body: bytes) -> None:
         self._queue(self._session.seal(kind, body))
 
-    def _encode(self, kind: int, message: Telemetry | Command | RangeScan) -> bytes:
+    def _encode(self, kind: int, message: Telemetry | Command | RangeScan | FramePiece) -> bytes:
         return self._session.seal(kind, _ENCODERS[type(message)](message))
 
     def _queue(self, datagram: Datagram) -> None:

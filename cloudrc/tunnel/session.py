@@ -20,6 +20,7 @@ from cloudrc.tunnel.codec import (
     HEADER_SIZE,
     LAST_GREETING,
     SCAN_SIZES,
+    SIZES,
     TAG_SIZE,
     TELEMETRY_SIZES,
     DecodeError,
@@ -30,7 +31,7 @@ from cloudrc.tunnel.codec import (
 )
 from cloudrc.tunnel.keys import Key, KeyRing
 
-COMMAND, SCAN = int(Kind.COMMAND), int(Kind.SCAN)  # looked up for each message
+COMMAND, SCAN, FRAME = int(Kind.COMMAND), int(Kind.SCAN), int(Kind.FRAME)  # often looked up
 NO_EPOCH = 0  # epoch of an end without a session, and of every HELLO, CHALLENGE and BUSY datagram
 TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}  # kinds without a session
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
@@ -75,7 +76,7 @@ class Session:
         return header + self._sealing.encrypt(header[4:], body, header)
 
     def pass_on(self, kind: int, message: Any) -> Passed:
-        """Give telemetry, a command or a scan the counter of its next datagram, unencrypted.
+        """Give a message of a session the counter of its next datagram, without encryption.
 
         Use this method in place of `seal` only if the receiver is in the same process: the result
         is a Python object, not bytes.
@@ -87,6 +88,8 @@ class Session:
             size = COMMAND_SIZES[len(message.plan)]
         elif kind == SCAN:
             size = SCAN_SIZES[len(message.millimetres)]
+        elif kind == FRAME:
+            size = SIZES[FRAME] + len(message.data)
         else:
             size = TELEMETRY_SIZES[len(message.sensors)]
         return _new(Passed, (kind, self.epoch, counter, message, size))

@@ -38,6 +38,7 @@ from cloudrc.records import (
     ContactForce,
     Counted,
     EnergyUsed,
+    FrameSent,
     GroundTruth,
     SensorRead,
     SessionOpened,
@@ -49,6 +50,7 @@ from cloudrc.tunnel.channel import REPEATED, USED
 from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
 from cloudrc.tunnel.handshake import ServerHandshake
+from cloudrc.world.filming import Film
 from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.sensors import Sensors
 
@@ -64,9 +66,10 @@ COUNT_PERIOD_NS = 1_000_000_000
 """Time between two records of the counters [ns]."""
 SLOW_TEXT = "simulated time is slower than real time; give world more processor time"
 TRACK = GuardState.TRACK  # looking up a member of an enum is slow
-COMMAND, TELEMETRY, SCAN = int(Kind.COMMAND), int(Kind.TELEMETRY), int(Kind.SCAN)  # looked up often
-NO_SCAN_NS = 1 << 63
-"""Time of the next scan if there is none [ns]: later than any clock shows."""
+COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
+SCAN, FRAME = int(Kind.SCAN), int(Kind.FRAME)
+NEVER_DUE_NS = 1 << 63
+"""Time of the next scan or picture if there is none [ns]: later than any clock shows."""
 _new = tuple.__new__  # makes a named tuple in half the time of its own constructor
 
 
@@ -83,33 +86,33 @@ class WorldEndpoint(TunnelEnd):
         odometry_period_ns: int = ODOMETRY_PERIOD_NS,
         start_ns: int = 0,
         scanner: Scanner | None = None,
+        film: Film | None = None,
     ) -> None:
         """Connect a robot that is switched off to the tunnel; there is no session yet.
 
         With `newest_wins`, a command that arrives after a newer command is dropped.
         `odometry_period_ns` is the time between two odometry samples [ns], a multiple of the step.
         `start_ns` is the present time on the monotonic clock [ns]. Without a `scanner`, no scans
-        are sent.
+        are sent, and without a `film` no pictures.
         """
-        counts = robot.guard.counts
-        super().__init__(identity, Direction.UPLINK, counts, newest_wins=newest_wins)
+        super().__init__(identity, Direction.UPLINK, robot.guard.counts, newest_wins=newest_wins)
         self.robot, self._sensors = robot, sensors
         self._run_robot = robot.advance if robot.name else robot.run  # only a user's code may fail
         self._tick_ns, self._slip_ns = start_ns, 0  # world's clock and its lag
         self._command_age_max_ns = age_max_ns = robot.guard.command_age_max_ns
         self._door = ServerHandshake(self._session, identity.nonce, identity.clock_id, age_max_ns)
-        self._stalled_wake_ns = NEVER_NS
-        self._sample_ns = self._odometry_ns = start_ns
+        # When the next sample, telemetry, and the next sample, scan or picture are due.
+        self._sample_ns = self._odometry_ns = self._look_ns = start_ns
         self._odometry_period_ns = odometry_period_ns
         self._sample_period_ns = min(odometry_period_ns, ODOMETRY_PERIOD_NS)
         self._count_ns = start_ns + COUNT_PERIOD_NS
-        self._scanner, self._scan_ns = scanner, NO_SCAN_NS
-        self._look = self._sample if scanner is None else self._sample_and_scan
-        self._look_ns = start_ns  # time of the next sample or scan
-        self._scans, self._scans_from_ns = 0, start_ns  # number in this session, its beginning
+        self._scanner, self._film, self._session_ns = scanner, film, start_ns
+        self._look = self._sample_and_sense if scanner or film else self._sample
+        self._scans = self._frames = 0  # that were due in this session
+        self._scan_ns = self._frame_ns = NEVER_DUE_NS
         self._counted_slip_ns: int | None = None
         self._waiting: tuple[int, int, Command] | None = None
-        self._echo_stamp_ns = self._applied_ns = NEVER_NS
+        self._stalled_wake_ns = self._echo_stamp_ns = self._applied_ns = NEVER_NS
         self._number = 0  # of the newest operator request carried out in this session
         # Of the mission that was started last: its number, waypoints reached as reported by the
         # operator, contacts with obstacles, name of the body that the mission has to touch ("" for
@@ -130,13 +133,14 @@ class WorldEndpoint(TunnelEnd):
         return self._slip_ns
 
     def next_deadline_ns(self) -> int:
-        """Return when the next sample of the true state or scan is due [ns], monotonic clock."""
+        """Return when the next sample, scan or picture is due [ns], monotonic clock."""
         return self._look_ns + self._slip_ns
 
     def handle_deadline(self, now_ns: int) -> None:
         """Simulate up to `now_ns` [ns]; send the telemetry that is due."""
         self._session.follow_keys()
         self._advance(self._follow(now_ns), samples=True)
+        self._send_picture()
 
     def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Handle a datagram that arrived at `now_ns` [ns]; count and drop an invalid datagram."""
@@ -146,6 +150,7 @@ class WorldEndpoint(TunnelEnd):
             if kind == COMMAND:
                 command = codec.decode_command(body) if type(body) is bytes else body
                 self._receive_command(epoch, counter, command, now_ns, world_ns)
+                self._send_picture()
             elif kind == Kind.HELLO:
                 self._advance(world_ns)
                 self._receive_hello(Hello(*codec.decode(Kind.HELLO, body)), counter, now_ns)
@@ -179,7 +184,7 @@ class WorldEndpoint(TunnelEnd):
     def _advance(self, until_ns: int, *, samples: bool = False) -> None:
         """Simulate all steps that begin before `until_ns` [ns], world's clock.
 
-        With `samples`, also take the sample of the true state and the scan due at `until_ns`.
+        With `samples`, also take the sample of the true state, scan and picture due at `until_ns`.
 
         If an earlier call has taken this sample, also simulate the step that begins at `until_ns`.
         So a datagram that arrives at the time of a sample acts from the next step on.
@@ -237,21 +242,38 @@ class WorldEndpoint(TunnelEnd):
         self._sample_ns += self._sample_period_ns
         self._look_ns = self._sample_ns
 
-    def _sample_and_scan(self, now_ns: int) -> None:
-        """Take the sample and the scan, those that are due."""
+    def _sample_and_sense(self, now_ns: int) -> None:
+        """Take the sample, the scan and the picture, those that are due."""
         if now_ns >= self._sample_ns:
             self._sample(now_ns)
-        if now_ns >= self._scan_ns:
-            self._scan(now_ns)
-        self._look_ns = min(self._sample_ns, self._scan_ns)
+        if self._scanner is not None and now_ns >= self._scan_ns:
+            self._scans += 1
+            self._scan_ns = self._due_ns(self._scans, self._scanner.config.rate_hz)
+            self._scan(self._scanner, now_ns)
+        if self._film is not None and now_ns >= self._frame_ns:
+            self._frames += 1
+            self._frame_ns = self._due_ns(self._frames, self._film.rate_hz)
+            self._film.take(now_ns)
+            self._send_picture()
+        self._look_ns = min(self._sample_ns, self._scan_ns, self._frame_ns)
 
-    def _scan(self, now_ns: int) -> None:
-        """Scan and send the distances; the next scan is due at the first step of its period."""
-        scanner = self._scanner
-        assert scanner is not None, "only a scanner has a time"
-        self._scans += 1
-        steps = -(-self._scans * 1_000_000_000 // (scanner.config.rate_hz * STEP_NS))
-        self._scan_ns = self._scans_from_ns + steps * STEP_NS
+    def _due_ns(self, number: int, rate_hz: int) -> int:
+        """Return the first physics step of a period of the session [ns]."""
+        return self._session_ns + -(-number * 1_000_000_000 // (rate_hz * STEP_NS)) * STEP_NS
+
+    def _send_picture(self) -> None:
+        """Send the picture that is ready, if there is one, piece by piece."""
+        if self._film is None or (picture := self._film.finished()) is None:
+            return
+        counter, pieces = self._session.next_counter(FRAME), [*picture.pieces()]
+        for piece in pieces:
+            self._queue(self._make_datagram(FRAME, piece))
+        epoch, (data, key) = self._session.epoch, picture.encoded
+        which = self._tick_ns, epoch, picture.number, picture.stamp_ns, picture.encode_ns
+        self._records.append(FrameSent(*which, counter, len(pieces), len(data), key, picture.psnr))
+
+    def _scan(self, scanner: Scanner, now_ns: int) -> None:
+        """Scan and send the distances."""
         scan = scanner.measure(now_ns)
         epoch, counter = self._session.epoch, self._session.next_counter(SCAN)
         self._queue(self._make_datagram(SCAN, scan))
@@ -328,8 +350,13 @@ class WorldEndpoint(TunnelEnd):
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
         self._told.clear()
         epoch, now_ns = self._session.epoch, self._tick_ns
+        self._scans, self._frames, self._session_ns = 0, 0, now_ns
         if self._scanner is not None:
-            self._scans, self._scans_from_ns, self._scan_ns = 0, now_ns, now_ns
+            self._scan_ns = now_ns
+        if self._film is not None:
+            self._film.begin_session()
+            self._frame_ns = now_ns
+        if self._scanner is not None or self._film is not None:
             self._look_ns = min(self._sample_ns, now_ns)
         self._records.append(SessionOpened(now_ns, "world", epoch, cause))
         for observer in self.robot.observers:

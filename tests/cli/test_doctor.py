@@ -7,6 +7,7 @@ import signal
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,7 +15,10 @@ from cloudrc.cli import doctor as work
 from cloudrc.cli.doctor import Check
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.runs import requirements
+from cloudrc.sim import egl
+from tests.support.camera import needs_renderer
 
+PLAIN = SimpleNamespace(camera=False)
 GOOD = Check("python", "ok", "3.12.1", "", ("local", "virtual"))
 NO_HELM = Check("helm", "missing", "not in PATH", "https://helm.sh", ("cluster",))
 NO_PHYSICS = Check("physics", "missing", "aborted", "install mujoco", ("local", "virtual"))
@@ -39,7 +43,7 @@ def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, c
 def test_every_problem_says_how_to_fix_it(monkeypatch):
     monkeypatch.setitem(requirements.EXTRAS, "world", ("no_such_module",))
     monkeypatch.setattr(work, "step_once", lambda: sys.exit("no physics"))
-    checks = {check.name: check for check in work.all_checks("local", None)}
+    checks = {check.name: check for check in work.all_checks("local", PLAIN)}
     for check in checks.values():
         assert check.state == "ok" or check.fix, check.name
         assert len(f"  missing  {check.name}  {check.found}") < 160
@@ -52,8 +56,24 @@ def test_every_problem_says_how_to_fix_it(monkeypatch):
 
 def test_a_library_that_kills_its_process_is_told(monkeypatch):
     monkeypatch.setattr(work, "step_once", lambda: os.kill(os.getpid(), signal.SIGKILL))
-    checks = {check.name: check for check in work.all_checks("local", None)}
+    checks = {check.name: check for check in work.all_checks("local", PLAIN)}
     assert (checks["physics"].state, checks["physics"].found) == ("missing", "exit code -9")
+
+
+@pytest.mark.parametrize("camera", [pytest.param(True, marks=needs_renderer), False])
+def test_a_machine_that_renders_is_told(camera):
+    checks = {
+        check.name: check for check in work.all_checks("local", SimpleNamespace(camera=camera))
+    }
+    assert checks["camera"].state == "ok"
+    assert (" ms " in checks["camera"].found) is camera
+
+
+def test_a_machine_without_egl_is_told(monkeypatch):
+    monkeypatch.setattr(egl, "LIBRARY", "no-such-library.so")
+    checks = {check.name: check for check in work.all_checks("local", PLAIN)}
+    assert checks["camera"].state == "warn"
+    assert checks["camera"].fix.startswith("run: apt-get")
 
 
 def test_the_extras_are_those_of_pyproject():

@@ -51,7 +51,8 @@ def _strategy(name, kind):
         return st.sampled_from(kind)
     if name == "stamp_ns":
         return _stamps
-    return {int: _integers, float: st.floats(), bool: st.booleans(), str: st.text()}[kind]
+    simple = {int: _integers, float: st.floats(), bool: st.booleans(), str: st.text()}
+    return {**simple, bytes: st.binary()}[kind]
 
 
 def instances(cls):

@@ -49,6 +49,7 @@ EXAMPLES = {
     "vector": (0.1, -2.0, 3.0),
     "quaternion": (1.0, 0.0, 0.0, 0.0),
     "floats": [0.5, math.inf],
+    "bytes": b"\xff\xd8",
 }
 
 

@@ -13,12 +13,22 @@ from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import CHUNK_NS, McapWriter
-from cloudrc.records import GuardChange, Perceived, ScanTaken
+from cloudrc.records import (
+    FrameKept,
+    FrameSent,
+    FrameShown,
+    GuardChange,
+    Perceived,
+    ScanTaken,
+)
 from tests.record.conftest import MS, SECOND, cloud_records, world_records, write
 from tests.support.programs import loaded
 
 SEEN = (
     ScanTaken(3001 * MS, 1, 2, -0.5, 0.5, 0.125, 10.0, [1.0, 2.0, 0.5]),
+    FrameSent(3001 * MS, 1, 2, 3000 * MS, 0, 7, 3, 2500, True, 40.5),
+    FrameShown(3002 * MS, 1, 2, 3000 * MS, 0),
+    FrameKept(3002 * MS, "jpeg", b"\xff\xd8"),
     Perceived(3002 * MS, 3001 * MS, 0, 0, 0, 1, 2, (1.0, 2.0, 3.0)),
 )
 RECORDS = [*world_records(150), *cloud_records(150, 1500 * MS), *SEEN]

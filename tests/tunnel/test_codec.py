@@ -8,10 +8,12 @@ from hypothesis import strategies as st
 
 from cloudrc.link.verify.probe import PROBE
 from cloudrc.messages import (
+    PIECE_MAX,
     RAYS_MAX,
     SENSORS_MAX,
     Cause,
     Command,
+    FramePiece,
     GuardState,
     Odometry,
     OperatorRequest,
@@ -49,6 +51,13 @@ requests = st.builds(
 )
 distances = st.lists(unsigned[16], max_size=RAYS_MAX).map(tuple)
 scans = st.builds(RangeScan, stamps, distances)
+pieces = st.integers(1, 2**16 - 1).flatmap(
+    lambda count: st.builds(
+        FramePiece,
+        *(stamps, unsigned[32], st.integers(0, count - 1), st.just(count), st.booleans()),
+        st.binary(min_size=1, max_size=PIECE_MAX),
+    )
+)
 
 
 COME_BACK = {
@@ -56,6 +65,7 @@ COME_BACK = {
     "command": commands,
     "operator": requests,
     "scan": scans,
+    "piece": pieces,
 }
 
 
@@ -85,7 +95,8 @@ def outcome(read, data):
 
 @pytest.mark.parametrize("kind", list(Kind))
 def test_every_wrong_length_direction_and_version_is_refused(kind):
-    body = bytes(codec.BODY_SIZES[kind] + codec.TAG_SIZE)
+    smallest = kind is Kind.FRAME  # at least a byte of the picture
+    body = bytes(codec.BODY_SIZES[kind] + codec.TAG_SIZE + smallest)
     whole = codec.encode_header(kind, 0, 1, 2) + body
     assert outcome(codec.check, whole) == "fine"
     longer = {
@@ -93,6 +104,7 @@ def test_every_wrong_length_direction_and_version_is_refused(kind):
         Kind.OPERATOR: {len(whole) + n for n in range(1, 65)},
         Kind.TELEMETRY: {len(whole) + 8 * n for n in range(1, 17)},
         Kind.SCAN: {len(whole) + 2 * n for n in range(1, 542)},
+        Kind.FRAME: {len(whole) + n for n in range(1, PIECE_MAX)},
     }.get(kind, set())
     assert max(longer, default=0) <= codec.DATAGRAM_MAX <= 1200
     for length in {*range(1300), 2048} - longer - {len(whole)}:
@@ -108,7 +120,7 @@ def test_every_wrong_length_direction_and_version_is_refused(kind):
 
 def test_an_unknown_kind_is_refused_at_every_length():
     """For example, a probe of `link verify` has the header of a tunnel's datagram."""
-    for kind in (0, 10, PROBE):
+    for kind in (0, 11, PROBE):
         for size in sorted({codec.HEADER_SIZE, *codec.SIZES.values(), codec.DATAGRAM_MAX}):
             data = codec.encode_header(kind, 1, 1, 2).ljust(size, b"\0")
             assert outcome(codec.check, data) == "malformed"
@@ -116,6 +128,7 @@ def test_an_unknown_kind_is_refused_at_every_length():
 
 
 LARGEST = codec.encode_operator(OperatorRequest(1, Request.PROGRESS, Start.HERE, 2**63 - 1))
+PIECE = codec.encode_piece(FramePiece(1, 2, 0, 2, False, b"."))
 TELEMETRY = bytes(codec.BODY_SIZES[Kind.TELEMETRY])
 
 
@@ -125,6 +138,8 @@ TELEMETRY = bytes(codec.BODY_SIZES[Kind.TELEMETRY])
         (codec.decode_operator, LARGEST, 4, max(Request)),
         (codec.decode_operator, LARGEST, 5, max(Start)),
         (codec.decode_operator, LARGEST, 13, 0x7F),  # a mission that no recording can name
+        (codec.decode_piece, PIECE, 12, 1),  # of two
+        (codec.decode_piece, PIECE, 16, True),
         (codec.decode_telemetry, TELEMETRY, -2, max(GuardState)),
         (codec.decode_telemetry, TELEMETRY, -1, max(Cause)),
     ],

@@ -4,7 +4,7 @@
 
 import pytest
 
-from cloudrc.messages import ZERO, Command, RangeScan
+from cloudrc.messages import ZERO, Command, FramePiece, RangeScan
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
@@ -170,6 +170,7 @@ def test_a_passed_message_has_the_counter_of_its_datagram():
     [
         (Kind.COMMAND, Command(1, 2, 3, ZERO, 0.0, (ZERO, ZERO)), codec.encode_command),
         (Kind.SCAN, RangeScan(1, (0, 300, 20)), codec.encode_scan),
+        (Kind.FRAME, FramePiece(1, 2, 0, 1, True, b"jpeg"), codec.encode_piece),
     ],
 )
 def test_a_passed_message_is_as_long_as_its_datagram(kind, message, encode):
