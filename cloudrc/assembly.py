@@ -29,10 +29,11 @@ from cloudrc.cloud.perceiving import Here, Perceiver
 from cloudrc.cloud.planar import Planar
 from cloudrc.config import schema
 from cloudrc.config.faults import CLOUD_KILLED, CLOUD_PAUSED, WORLD_PAUSED, acting
+from cloudrc.config.mission_check import start_of
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import RobotFacts, facts, is_planar, known_robot
-from cloudrc.config.scene import steered_in
+from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.config.time_line import find_ways
 from cloudrc.drivers.channels import find_channel
@@ -48,7 +49,7 @@ from cloudrc.messages import Start
 from cloudrc.outside.code import apart
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.records import CONTROLLER_LOST, Fault
-from cloudrc.sensing import build_film, build_receiver, build_scanner
+from cloudrc.sensing import build_film, build_receiver, build_scanner, build_target
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.wire import Leg, Plan
 from cloudrc.tunnel.end import Identity
@@ -249,6 +250,7 @@ def build_world(
         start_ns=clock(),
         scanner=build_scanner(experiment, robot, generator(seed, "scan noise", experiment.stream)),
         film=build_film(experiment, robot, make_worker),
+        target=build_target(experiment, robot),
     )
 
 
@@ -415,6 +417,10 @@ def build_plan(
         mission, time_limit = experiment.mission, experiment.criteria.time_limit_s
     fence = steered_in(experiment.world)
     track = read_setpoints(Path(mission.setpoints), fence) if mission.setpoints else ()
+    if (follow := mission.follow) is not None:
+        world = experiment.world
+        place = start_of(follow, scene_of(world), planar=is_planar(world.robot))
+        track = (0.0, place), (follow.duration_s, place)
     if track:
         legs: tuple[Leg, ...] = (Leg(track[0][1], tolerance=inf, time_limit=inf),)
         needed = LEG_FACTOR * track[-1][0]
@@ -430,7 +436,7 @@ def build_plan(
         needed = sum(leg.time_limit for leg in legs)
     start = Start.SPAWN if mission.start == "spawn" else Start.HERE
     limit = time_limit or max(LIMIT_MIN, needed)
-    return Plan(legs, start, limit, track=track, judged_by=mission.judged_by)
+    return Plan(legs, start, limit, track=track, judged_by=mission.judged_by, follow=follow)
 
 
 def with_order(
@@ -453,12 +459,13 @@ def with_order(
             time_limit_s=leg.time_limit,
             speed_mps=leg.speed or None,
         )
-        for leg in ([] if order.plan.by_hand else legs)
+        for leg in ([] if order.plan.by_hand or order.plan.follow else legs)
     )
     mission = schema.MissionConfig(
         start="spawn" if order.plan.start is Start.SPAWN else "here",
         waypoints=waypoints,
         setpoints=DRIVE_FILE if order.plan.by_hand else None,
+        follow=order.plan.follow,
         carrot=carrot,
         judged_by=order.plan.judged_by,
         touch=order.touch,

@@ -205,6 +205,19 @@ class FrameKept(NamedTuple):
     data: Annotated[bytes, "", "the file"]
 
 
+class TargetSeen(NamedTuple):
+    """Made by world at each sample of the true state: where the body is that the mission follows.
+
+    Topics /target and /target_view. Angle and distance are true, too, and lead from the camera.
+    """
+
+    stamp_ns: int
+    position: Annotated[Vector, "m", "of the moving body, world frame"]
+    bearing: Annotated[float, "rad", "from the axis of the robot's camera, rising to the left"]
+    distance: Annotated[float, "m", "from the robot's camera"]
+    in_picture: Annotated[bool, "", "true if the body's origin is inside the camera's picture"]
+
+
 class Arrival(NamedTuple):
     """Made by world or cloud: a datagram with a command or telemetry arrived, even if late.
 
@@ -459,6 +472,6 @@ Record: TypeAlias = (
     (TelemetrySent | GroundTruth | ContactForce | SensorRead | Arrival | CommandApplied)
     | (EnergyUsed | Left | CellWait | LinkWait)
     | (GuardChange | Contact | SessionOpened | Control | PlanFollowed | MissionEvent)
-    | (ScanTaken | Perceived | FrameSent | FrameShown | FrameKept)
+    | (ScanTaken | Perceived | FrameSent | FrameShown | FrameKept | TargetSeen)
     | (Fault | Counted | LinkChanged | LinkChecked | Lateness)
 )

@@ -13,11 +13,13 @@ import numpy as np
 from cloudrc.cloud.receiving import FrameReceiver
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import known_robot
+from cloudrc.config.scene import scene_of
 from cloudrc.endpoint import Worker
 from cloudrc.pictures import Image, as_png, describe_codec, make_decoder, make_encoder
 
 if TYPE_CHECKING:
     from cloudrc.sim.scan import Scanner
+    from cloudrc.sim.target import MovingTarget
     from cloudrc.world.filming import Film
     from cloudrc.world.robot import Robot
 
@@ -58,6 +60,21 @@ def build_film(
         worker,
         robot.guard.counts,
     )
+
+
+def build_target(experiment: ResolvedExperiment, robot: Robot) -> MovingTarget | None:
+    """Build what moves the body that a robot with a camera may follow; None if none moves.
+
+    Of several, that of the mission moves, or the first one.
+    """
+    follow, camera = experiment.mission.follow, known_robot(experiment.world.robot).camera
+    bodies = {each.name: each for each in scene_of(experiment.world).moving}
+    if camera is None or not bodies:
+        return None
+    from cloudrc.sim.target import MovingTarget
+
+    moving = bodies[follow.target if follow is not None else next(iter(bodies))]
+    return MovingTarget(robot.simulator.model, robot.simulator.data, moving, camera)
 
 
 def build_receiver(experiment: ResolvedExperiment) -> FrameReceiver | None:

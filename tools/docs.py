@@ -63,7 +63,7 @@ _STAMPS = {
      "100 Hz by default, in a session"):
         "/odometry /telemetry",
     ("instant of the physics step", "100 Hz, or the rate of the odometry if it is higher"):
-        "/ground_truth /contact_force /sensor /reference",
+        "/ground_truth /contact_force /sensor /reference /target /target_view",
     ("instant of the physics step", "1 Hz, and once per row of /guard"): "/energy",
     ("arrival at cloud", "once per telemetry that arrives"): "/uplink_delay",
     ("arrival at world", "once per command that arrives"): "/downlink_delay",

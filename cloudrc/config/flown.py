@@ -12,6 +12,7 @@ import numpy as np
 
 from cloudrc.geometry.clearance import Spheres
 from cloudrc.geometry.fence import Fence
+from cloudrc.geometry.moving import Moving
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import Plate, Scene, Tube
 from cloudrc.geometry.solids import Solid
@@ -37,6 +38,8 @@ class FlownWorld:
     def to_bytes(self) -> bytes:
         """Return the content of a file, which `from_bytes` reads: every number is kept exactly."""
         scene = asdict(replace(self.scene, path=None, own_fence=fence_of(self.scene)))
+        if not self.scene.moving:  # scenes without one keep their bytes
+            del scene["moving"]
         hull = None if self.hull is None else self.hull._asdict()
         tree = {"scene": scene, "hull": hull, "planar": self.planar}
         return json.dumps(tree, default=lambda array: array.tolist()).encode()
@@ -65,6 +68,7 @@ def _scene(tree: dict[str, Any]) -> Scene:
         "plates": tuple(Plate(**each) for each in tree["plates"]),
         "own_fence": Fence(**tree["own_fence"]),
         "solids": tuple(map(_solid, tree["solids"])),
+        "moving": tuple(Moving(**each) for each in tree.get("moving", ())),
     }
     return Scene(**tree | parts)
 

@@ -16,11 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
+from cloudrc.config.follow import Follow
 from cloudrc.config.ground import check_heights
 from cloudrc.config.heading import check_yaws
 from cloudrc.config.hull import hull_of
 from cloudrc.config.problems import ConfigProblem, collect
-from cloudrc.config.robot import known_robot
+from cloudrc.config.robot import RobotFiles, known_robot
 from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.config.schema import MissionConfig, Steps, World
 from cloudrc.config.setpoints import read_setpoints
@@ -82,6 +83,8 @@ def check_mission(
     if problems:
         return problems
     fence, hull = steered_in(world), hull_of(world.robot)
+    if mission.follow is not None:
+        return [*_check_follow(mission.follow, robot, scene, fence)]
     if mission.setpoints is not None:
         with collect(problems, ("setpoints",)):
             read_setpoints(Path(mission.setpoints), fence)
@@ -96,10 +99,11 @@ def check_mission(
 
 def _check_parts(mission: MissionConfig) -> ConfigProblem | None:
     """Return the first problem of parts that exclude or need each other."""
-    given = [key for key in ("waypoints", "steps", "setpoints") if getattr(mission, key)]
+    kinds = "waypoints", "steps", "setpoints", "follow"
+    given = [key for key in kinds if getattr(mission, key)]
     if len(given) != 1:
         what = f"not both: {' and '.join(given)}" if given else "none given"
-        reason = f"{what}; give waypoints, or steps, or setpoints"
+        reason = f"{what}; give waypoints, or steps, or setpoints, or follow"
         return ConfigProblem(("waypoints",), "", reason)
     if mission.carrot is not None and not mission.waypoints:
         return ConfigProblem(("carrot",), "", f"needs waypoints, but there are {given[0]}")
@@ -123,6 +127,32 @@ def _check_touch(mission: MissionConfig, scene: Scene) -> ConfigProblem | None:
         return None
     text = unknown_name_text(f"body of the scene {scene.name}", body, known)
     return ConfigProblem(("touch", "body"), body, f"{text}; null: nothing to touch")
+
+
+def _check_follow(
+    follow: Follow, robot: RobotFiles, scene: Scene, fence: Fence
+) -> Iterator[ConfigProblem]:
+    """Yield why a robot cannot keep a body in view."""
+    known = [each.name for each in scene.moving]
+    if follow.target not in known:
+        reason = unknown_name_text(f"moving body of the scene {scene.name}", follow.target, known)
+        yield ConfigProblem(("follow", "target"), follow.target, reason)
+    elif scene.path is None and follow.target not in scene.intangible:
+        reason = 'it would push the robot: give its geoms contype="0" and conaffinity="0"'
+        yield ConfigProblem(("follow", "target"), follow.target, reason)
+    if robot.camera is None:
+        reason = "the robot has no camera: choose x2, or give its robot.yaml the key camera"
+        yield ConfigProblem(("follow",), "", reason)
+    place = np.array([start_of(follow, scene, planar=robot.planar)])
+    if outside_fence(fence, place).any():
+        reason = f"beyond the fence, or too near to it; {_allowed(fence)}"
+        yield ConfigProblem(("follow", "height_m"), f"{follow.height_m:g}", reason)
+
+
+def start_of(follow: Follow, scene: Scene, *, planar: bool) -> Vector:
+    """Return where a robot waits that keeps a body in view, until it knows where to go [m]."""
+    x, y, z = scene.spawn
+    return x, y, z if planar else z + follow.height_m
 
 
 def _check_fence(mission: MissionConfig, fence: Fence) -> list[ConfigProblem]:

@@ -29,6 +29,7 @@ from cloudrc.config.cloud import Cloud
 from cloudrc.config.disturbances import Plant, SensorsConfig, WindConfig
 from cloudrc.config.faults import FaultConfig
 from cloudrc.config.fleet import CellConfig, FleetConfig
+from cloudrc.config.follow import Follow
 from cloudrc.config.profile import CommandAge, DirectionConfig, StartConfig
 from cloudrc.config.section import Section, leave_out_unset
 from cloudrc.geometry.fence import Corners, order_of
@@ -182,6 +183,8 @@ class MissionConfig(Section):
     setpoint over time, with straight lines between the rows. A robot on the ground needs no z_m.
     The mission ends with the last row; the robot must then be within criteria.settle_m of it. A
     drive by hand writes such a file, drive.csv"""
+    follow: Follow | None = None
+    """A moving body to keep in the camera's picture, in place of waypoints"""
     carrot: Carrot | None = None
     """Moves the setpoint at limited speed from waypoint to waypoint; null: the setpoint jumps"""
     judged_by: JudgedBy = "measured"
@@ -190,6 +193,8 @@ class MissionConfig(Section):
     predictor, for the time at which the next command arrives. The report judges by the true path"""
     touch: Touch | None = None
     """What the robot has to touch; null: nothing, every body but floor is an obstacle"""
+
+    _write = leave_out_unset("follow")
 
     @property
     def touched(self) -> str | None:
@@ -206,6 +211,8 @@ class MissionConfig(Section):
         """What the mission flies, in words, such as "7 waypoints"."""
         if self.setpoints:
             return f"setpoints of {PurePath(self.setpoints).name}"
+        if self.follow:
+            return f"following {self.follow.target} for {self.follow.duration_s:g} s"
         return f"{self.count} {self.unit}{'s' * (self.count != 1)}"
 
     @property
@@ -215,8 +222,9 @@ class MissionConfig(Section):
 
     @property
     def count(self) -> int:
-        """Number of waypoints or random setpoints; a file of setpoints counts as one waypoint."""
-        return self.steps.count if self.steps else 1 if self.setpoints else len(self.waypoints)
+        """Number of waypoints or random setpoints; what ends with time counts as one waypoint."""
+        ends = self.setpoints or self.follow
+        return self.steps.count if self.steps else 1 if ends else len(self.waypoints)
 
 
 class Parameters(Section):

@@ -11,11 +11,14 @@ data="..."/>`, in metres, world frame. The name of a tube or plate is that of it
 | a body | 5 numbers, a plate: x of the front face, smallest and largest y, smallest and largest z |
 | `floor` | z; 0 if the file has no `floor` |
 | `fence` | corner with the smallest x y z, corner with the largest |
+| a body with `_path` | points x y z, two or more, along which it moves round and round |
+| a body with `_speed` | its speed [m/s] |
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -23,6 +26,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from cloudrc.geometry.fence import Corners, Fence, order_of
+from cloudrc.geometry.moving import Moving
 from cloudrc.geometry.solids import Array, Solid
 from cloudrc.messages import Vector
 from cloudrc.outside.values import InvalidValueError
@@ -90,6 +94,7 @@ class Scene:
     solids: tuple[Solid, ...] = ()  # all that the robot can touch, without the floor
     bodies: tuple[str, ...] = ()  # names of all bodies with geoms
     intangible: tuple[str, ...] = ()  # names of those that the robot flies through
+    moving: tuple[Moving, ...] = ()  # bodies that move
 
 
 def is_obstacle(body: str, *, touch: str | None) -> bool:
@@ -161,7 +166,26 @@ def _read(root: ElementTree.Element, path: Path, *, is_shipped: bool) -> Scene:
         None if is_complete else path,
         _fence(_numbers(FENCE, numerics[FENCE], 6)) if FENCE in numerics else None,
         bodies=(FLOOR, *(shape.name for shape in shapes)),
+        moving=tuple(_moving(root, numerics)),
     )
+
+
+def _moving(root: ElementTree.Element, numerics: dict[str, str]) -> Iterator[Moving]:
+    for body in root.iter("body"):
+        name = body.get("name", "")
+        path, speed = (f"{name}_{what}" for what in ("path", "speed"))
+        if path not in numerics:
+            continue
+        if body.get("mocap") != "true":
+            raise ValueError(f'{name}: has the numbers {path}, so it needs mocap="true"')
+        words = numerics[path].split()
+        flat = _numbers(path, numerics[path], max(len(words) // 3, 2) * 3)
+        (pace,) = _numbers(speed, numerics.get(speed, ""), 1)
+        if pace <= 0:
+            raise ValueError(f"{speed}: data must be a speed above 0 [m/s]: {numerics[speed]!r}")
+        if _numbers(name, body.get("pos", "0 0 0"), 3) != flat[:3]:
+            raise ValueError(f"{name}: its pos must be the first point of {path}")
+        yield Moving(name, tuple(zip(flat[::3], flat[1::3], flat[2::3], strict=True)), pace)
 
 
 def _fence(numbers: list[float]) -> Fence:

@@ -217,6 +217,10 @@ _add(
     ("video_kbit", "kbit/s", "Mean bit rate of the encoded pictures, without headers."),
     ("frames_late", "1", "Number of pictures that world did not take, because the one before was "
      "still being rendered. In real time only."),
+    ("out_of_view", "1", "Share of the flight in which the target of mission.follow was in truth "
+     "outside of the camera's picture, or farther than distance_max_m."),
+    ("bearing_error_rms", "rad", "Root mean square of the angle to the side between the axis of "
+     "the camera and the target, true positions."),
     *((f"budget_{_stage}", "s", f"Mean of a stage of seen_to_acted: {_words}.")
       for _stage, _words in SCAN_STAGES.items()),
 )  # fmt: skip

@@ -12,7 +12,16 @@ from typing import NamedTuple
 
 from cloudrc import plugins
 from cloudrc.errors import describe_error
-from cloudrc.metrics import budget, camera, control, link, mission, perception, response
+from cloudrc.metrics import (
+    budget,
+    camera,
+    control,
+    follow,
+    link,
+    mission,
+    perception,
+    response,
+)
 from cloudrc.metrics.flight import SHIPPED, Flight, Metric, add_quantities
 from cloudrc.outside import code
 from cloudrc.outside.patience import telling_if_slow
@@ -23,7 +32,8 @@ from cloudrc.record.holes import goes_on
 # The imported modules add the metrics of cloudrc to SHIPPED.
 add_quantities()
 __all__ = ["SHIPPED", "Flight", "Metric"]
-__all__ += ["budget", "camera", "control", "link", "mission", "perception", "response"]
+__all__ += ["budget", "camera", "control", "follow", "link", "mission", "perception"]
+__all__ += ["response"]
 
 METRIC_NOTE = "metric "
 """Beginning of a note about a metric."""

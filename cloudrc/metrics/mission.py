@@ -80,7 +80,7 @@ def _waypoints_reached(flight: Flight) -> float | None:
     None if messages are lost and the others do not prove all waypoints.
     """
     stamps, points = reported(flight), flight.mission.waypoints
-    if flight.mission.steps:  # they end after their time, anywhere
+    if flight.mission.steps or flight.mission.follow:  # they end after their time, anywhere
         count = len(stamps)
     elif flight.mission.setpoints is not None:
         count = int(bool(stamps) and missed_end(flight) is None)

@@ -32,13 +32,9 @@ from cloudrc.messages import Cause, GuardState, Vector
 from cloudrc.metrics.counters import growth
 from cloudrc.metrics.definitions import real_time_factor
 from cloudrc.metrics.flight import Flight, between, rows_of
+from cloudrc.metrics.follow import target_lost
 from cloudrc.metrics.measure import Number
-from cloudrc.metrics.mission import (
-    missed_end,
-    obstacle_contacts,
-    reported,
-    unconfirmed,
-)
+from cloudrc.metrics.mission import missed_end, obstacle_contacts, reported, unconfirmed
 from cloudrc.metrics.response import responses
 from cloudrc.record import STOPPED
 from cloudrc.record.columns import Recording
@@ -80,6 +76,7 @@ FailureCode: TypeAlias = Literal[
     "obstacle_touched",
     "plugin_failed",
     "recording_incomplete",
+    "target_lost",
     "time_limit_exceeded",
     "unstable",
     "waypoint_not_reached",
@@ -293,6 +290,8 @@ def _violations(flight: Flight, kills: int) -> Iterator[FlightFailure]:
     yield from _interventions(flight)
     yield from _restarts(flight, kills)
     yield from plugin_failures(flight.recording, flight.span_ns)
+    if lost := target_lost(flight):
+        yield FlightFailure("target_lost", lost[0], *_moment(flight, lost[1]))
     if flight.criteria.settle_m is not None:
         yield from _responses(flight, flight.criteria.settle_m)
         yield from _missed_end(flight, flight.criteria.settle_m)

@@ -133,6 +133,11 @@ _TABLE = (
         also=(rec.ContactForce, "stamp_ns sensor.name sensor.unit force")),
     Topic("/scan", "sensor_msgs/msg/LaserScan", rec.ScanTaken, "world",
         "Distances that the robot's scanner measured, as sent to cloud, world's clock"),
+    Topic("/target", "geometry_msgs/msg/PointStamped", rec.TargetSeen, "world",
+        "True position of the moving body that a mission follows, world's clock", "position"),
+    Topic("/target_view", "cloudrc_msgs/msg/TargetSeen", rec.TargetSeen, "world",
+        "Where the camera of the robot has the body of /target in truth, world's clock",
+        "bearing distance in_picture"),
     Topic("/reference", "geometry_msgs/msg/TwistStamped", rec.GroundTruth, "world",
         "Velocity that the guard lets the onboard controller follow, world's clock", "reference"),
     Topic("/energy", "cloudrc_msgs/msg/EnergyUsed", rec.EnergyUsed, "world",
@@ -203,7 +208,10 @@ _TABLE = (
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 """Name -> topic, for every topic of a recording."""
 
-ADDED = ("/plan", "/sensor", "/scan", "/perception", "/frame", "/frame_shown", "/camera")
+ADDED = (
+    *("/plan", "/sensor", "/scan", "/perception", "/frame", "/frame_shown", "/camera"),
+    *("/target", "/target_view"),
+)
 """Topics that came later than the others; without rows they do not change a hash."""
 UNHASHED = ("/energy", "/left", "/cell_wait", "/link_wait")
 """Topics that never change a hash: flights from before them keep theirs."""

@@ -302,7 +302,8 @@ class MissionFlight:
             # position is too noisy.
             if self.state == FLYING and self.elapsed(now_ns) >= track[-1][0]:
                 away = dist(seen.position, track[-1][1])
-                self._advance(f"flown to their end, {away:.2f} m from the last one", now_ns)
+                how = f"flown to their end, {away:.2f} m from the last one"
+                self._advance("is over" if self.plan.follow else how, now_ns)
             return
         while self.state == FLYING and self.route.is_reached(seen, now_ns):
             self._advance("over" if self.plan.unit == "step" else "reached", now_ns)

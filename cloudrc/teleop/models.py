@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import ConfigDict, Field, ValidationError
 
+from cloudrc.config.follow import Follow
 from cloudrc.config.ground import put_on_ground
 from cloudrc.config.heading import WHY, without_held_yaws
 from cloudrc.config.mission_check import check_mission
@@ -63,6 +64,8 @@ class MissionRequest(Section):
     """With all holds [s]; default: 3 times the expected time, at least 60 s"""
     waypoints: tuple[Waypoint, ...] = Field((), max_length=MAX_WAYPOINTS)
     """In order"""
+    follow: Follow | None = None
+    """What to keep in the camera's picture, in place of waypoints"""
     carrot: Carrot | None = None
     """How the setpoint moves; null: it jumps"""
     judged_by: JudgedBy = "measured"
@@ -327,9 +330,9 @@ class RequestReader:
     def order(self, body: bytes) -> Order:
         """Read and plan a mission."""
         request = _parse(body, MissionRequest)
-        if not request.waypoints:  # only an experiment may have steps instead
+        if not (request.waypoints or request.follow):  # only an experiment may have steps instead
             raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
-        kept = ("start", "waypoints", "carrot", "judged_by", "touch")
+        kept = ("start", "waypoints", "follow", "carrot", "judged_by", "touch")
         mission = MissionConfig(**{name: getattr(request, name) for name in kept})
         mission = put_on_ground(mission, self.world)
         if problems := check_mission(mission, self.world):

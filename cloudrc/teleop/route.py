@@ -43,13 +43,15 @@ class Route:
     @property
     def where(self) -> str:
         """Place in the mission, for an event's text, such as "on the way to waypoint 1 of 7"."""
+        if self.plan.follow:
+            return f"while {self.name}"
         return f"on the way {'along the' if self.plan.track else 'to'} {self.name}"
 
     @property
     def name(self) -> str:
         """Name of the waypoint, such as "waypoint 1 of 7"."""
         if self.plan.track:
-            return "setpoints"
+            return self.plan.track_name
         return f"{self.plan.unit} {self.leg + 1} of {len(self.plan.legs)}"
 
     def select(self, begin_ns: int, start: Vector | None = None) -> None:

@@ -15,6 +15,7 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 from pydantic import TypeAdapter
 from pydantic_core import to_json
 
+from cloudrc.config.follow import Follow
 from cloudrc.config.schema import YAW_TOLERANCE_DEG, JudgedBy
 from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import (
@@ -78,13 +79,19 @@ class Plan:
         tuple[float, Vector], ...
     ] = ()  # times [s] and setpoints [m]; none, or two or more
     judged_by: JudgedBy = "measured"  # position that shows that the robot is at a waypoint
+    follow: Follow | None = None  # what to keep in view; then the track rests at one place
 
     @property
     def contents(self) -> str:
         """What the mission flies, in words, such as "waypoints: 7"."""
         if self.track:
-            return f"setpoints for {self.track[-1][0]:g} s"
+            return f"{self.track_name} for {self.track[-1][0]:g} s"
         return f"{self.unit}s: {len(self.legs)}"
+
+    @property
+    def track_name(self) -> str:
+        """Name of the track."""
+        return f"following {self.follow.target}" if self.follow else "setpoints"
 
     @property
     def waypoints(self) -> tuple[Leg, ...]:

@@ -45,6 +45,8 @@ from cloudrc.records import (
     TelemetrySent,
 )
 from cloudrc.sim.scan import Scanner
+from cloudrc.sim.simulator import Simulator
+from cloudrc.sim.target import MovingTarget
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED
 from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
@@ -87,13 +89,14 @@ class WorldEndpoint(TunnelEnd):
         start_ns: int = 0,
         scanner: Scanner | None = None,
         film: Film | None = None,
+        target: MovingTarget | None = None,
     ) -> None:
         """Connect a robot that is switched off to the tunnel; there is no session yet.
 
         With `newest_wins`, a command that arrives after a newer command is dropped.
         `odometry_period_ns` is the time between two odometry samples [ns], a multiple of the step.
         `start_ns` is the present time on the monotonic clock [ns]. Without a `scanner`, no scans
-        are sent, and without a `film` no pictures.
+        are sent, and without a `film` no pictures. `target` is a body of the scene that moves.
         """
         super().__init__(identity, Direction.UPLINK, robot.guard.counts, newest_wins=newest_wins)
         self.robot, self._sensors = robot, sensors
@@ -105,8 +108,8 @@ class WorldEndpoint(TunnelEnd):
         self._sample_ns = self._odometry_ns = self._look_ns = start_ns
         self._odometry_period_ns = odometry_period_ns
         self._sample_period_ns = min(odometry_period_ns, ODOMETRY_PERIOD_NS)
-        self._count_ns = start_ns + COUNT_PERIOD_NS
-        self._scanner, self._film, self._session_ns = scanner, film, start_ns
+        self._count_ns, self._session_ns = start_ns + COUNT_PERIOD_NS, start_ns
+        self._scanner, self._film, self._target = scanner, film, target
         self._look = self._sample_and_sense if scanner or film else self._sample
         self._scans = self._frames = 0  # that were due in this session
         self._scan_ns = self._frame_ns = NEVER_DUE_NS
@@ -120,12 +123,7 @@ class WorldEndpoint(TunnelEnd):
         self._mission_id = self._reached = self._obstacles = 0
         self._touch_speed, self._touch = nan, ""
         self._shows = bool(robot.simulator.sensors)
-        # Number, name and unit of each sensor but that of the contact force, which has a record.
-        self._recorded = [
-            (number, name, unit)
-            for number, (name, unit, _) in enumerate(robot.simulator.sensors)
-            if (name, unit) != robot.simulator.force_sensor
-        ]
+        self._recorded = _recorded(robot.simulator)
 
     @property
     def slip_ns(self) -> int:
@@ -140,7 +138,8 @@ class WorldEndpoint(TunnelEnd):
         """Simulate up to `now_ns` [ns]; send the telemetry that is due."""
         self._session.follow_keys()
         self._advance(self._follow(now_ns), samples=True)
-        self._send_picture()
+        if self._film is not None:
+            self._send_picture(self._film)
 
     def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Handle a datagram that arrived at `now_ns` [ns]; count and drop an invalid datagram."""
@@ -150,7 +149,8 @@ class WorldEndpoint(TunnelEnd):
             if kind == COMMAND:
                 command = codec.decode_command(body) if type(body) is bytes else body
                 self._receive_command(epoch, counter, command, now_ns, world_ns)
-                self._send_picture()
+                if self._film is not None:
+                    self._send_picture(self._film)
             elif kind == Kind.HELLO:
                 self._advance(world_ns)
                 self._receive_hello(Hello(*codec.decode(Kind.HELLO, body)), counter, now_ns)
@@ -223,6 +223,8 @@ class WorldEndpoint(TunnelEnd):
         truth = simulator.truth(now_ns)
         shown = simulator.read_sensors() if self._shows else ()
         records.append(_new(GroundTruth, (now_ns, truth, guard.reference)))
+        if self._target is not None:
+            records.append(self._target.observe(now_ns))
         if (meter := simulator.meter) is not None:
             meter.sample()
             if guard.changes or now_ns >= self._count_ns:
@@ -253,17 +255,19 @@ class WorldEndpoint(TunnelEnd):
         if self._film is not None and now_ns >= self._frame_ns:
             self._frames += 1
             self._frame_ns = self._due_ns(self._frames, self._film.rate_hz)
+            if self._target is not None:
+                self._target.move(now_ns)
             self._film.take(now_ns)
-            self._send_picture()
+            self._send_picture(self._film)
         self._look_ns = min(self._sample_ns, self._scan_ns, self._frame_ns)
 
     def _due_ns(self, number: int, rate_hz: int) -> int:
         """Return the first physics step of a period of the session [ns]."""
         return self._session_ns + -(-number * 1_000_000_000 // (rate_hz * STEP_NS)) * STEP_NS
 
-    def _send_picture(self) -> None:
+    def _send_picture(self, film: Film) -> None:
         """Send the picture that is ready, if there is one, piece by piece."""
-        if self._film is None or (picture := self._film.finished()) is None:
+        if (picture := film.finished()) is None:
             return
         counter, pieces = self._session.next_counter(FRAME), [*picture.pieces()]
         for piece in pieces:
@@ -417,6 +421,8 @@ class WorldEndpoint(TunnelEnd):
                     self._queue(self._door.begin_next_epoch(now_ns))
                     self._begin_epoch("mission starts from spawn")
                 guard.start_mission(tick_ns)
+                if self._target is not None:
+                    self._target.begin(tick_ns)
         for observer in self.robot.observers:
             observer.see_request(request, tick_ns)
 
@@ -445,3 +451,15 @@ class WorldEndpoint(TunnelEnd):
         if used and robot.guard.state is TRACK:
             self._waiting = (epoch, counter, command)
         self.counts[outcome] += 1
+
+
+def _recorded(simulator: Simulator) -> list[tuple[int, str, str]]:
+    """Return number, name and unit of each sensor but that of the contact force.
+
+    That one has a record of its own.
+    """
+    return [
+        (number, name, unit)
+        for number, (name, unit, _) in enumerate(simulator.sensors)
+        if (name, unit) != simulator.force_sensor
+    ]

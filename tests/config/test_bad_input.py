@@ -42,8 +42,8 @@ def test_all_problems_are_listed_with_their_lines(mine):
         "mine.yaml:1: seed: 'one': must be a valid whole number",
         "mine.yaml:2: guard.speed_max: unknown key; did you mean speed_max_mps [m/s]?",
         "mine.yaml:3: link.uplink.delay_ms: -3: must be >= 0 [ms]",
-        "mine.yaml:4: world.scene: no scene named 'pipe'; available: corridor, empty, pillars, "
-        "pipes; did you mean pipes?; for one of your own, give its path, such as ./pipe",
+        "mine.yaml:4: world.scene: no scene named 'pipe'; available: corridor, empty, follow, "
+        "pillars, pipes; did you mean pipes?; for one of your own, give its path, such as ./pipe",
     ])  # fmt: skip
     text = "cloud:\n  predictor: last_sampel\n  controller: {name: pid, sped_max: 2}\n"
     found = refused_text(mine, text)
@@ -66,7 +66,8 @@ def test_fifty_problems_at_most_are_listed(mine):
         ("seed: 1\nname: !!python/name:os.system x", "mine.yaml:2: could not determine a constr"),
         ("guard: {speed_max_mps: 7}", "must be at most 6 m/s: above it the robot does not stop"),
         ("mission: {waypoints: []}",
-         "mine.yaml:1: mission.waypoints: none given; give waypoints, or steps, or setpoints"),
+         "mine.yaml:1: mission.waypoints: none given; give waypoints, or steps, or setpoints, "
+         "or follow"),
         ("mission: {waypoints: [{tolerance_m: 1}]}",
          "mission.waypoints.0.position_m: is missing"),
         ("mission: {waypoints: [{position_m: [0, 0, 3]}]}",

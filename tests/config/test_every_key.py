@@ -37,6 +37,7 @@ def test_every_key_is_described_and_dumped():
         "cloud.answers",
         "faults",
         "camera",
+        "mission.follow",
         "world.scan",
         "cloud.perception",
     ]  # left out where they have their default

@@ -333,6 +333,7 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
     others |= {"commands_withheld", "seen_dropped", "seen_to_acted", "seen_to_acted_p99"}
     others |= {"frames_shown", "frame_psnr", "video_kbit", "frames_late"}
     others |= {f"frame_age_{name}" for name in ("mean", "p99", "max")}
+    others |= {"out_of_view", "bearing_error_rms"}
     waits = [f"{way}_{name}" for way in WAYS for name in ("cell", "rate", "grant", "repeat")]
     others |= {f"budget_{name}" for name in ("compute", "uplink_request", *waits, *SCAN_STAGES)}
     assert set(SHIPPED) - set(numbers) == REAL_TIME | OF_RELAYS | resting | others

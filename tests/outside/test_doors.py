@@ -67,8 +67,8 @@ def keys(model):
     """Yield path and quantity of each key of a model whose value is a number or null."""
     for name, forms in forms_of(model).items():
         path = tuple(name.split("."))
-        # Below a loss there are keys that must be given, and some keys need another key.
-        is_alone = {"0", "loss", "touch"}.isdisjoint(path[:-1])
+        # Below some keys there are keys that must be given, and some keys need another key.
+        is_alone = {"0", "follow", "loss", "touch"}.isdisjoint(path[:-1])
         one = [form for form in forms if form.get("type") != "null"]
         is_number = len(one) == 1 and one[0].get("type") in ("number", "integer")
         is_alone = is_alone and path[-1] not in NEED_ANOTHER

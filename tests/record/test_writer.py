@@ -20,6 +20,7 @@ from cloudrc.records import (
     GuardChange,
     Perceived,
     ScanTaken,
+    TargetSeen,
 )
 from tests.record.conftest import MS, SECOND, cloud_records, world_records, write
 from tests.support.programs import loaded
@@ -29,6 +30,7 @@ SEEN = (
     FrameSent(3001 * MS, 1, 2, 3000 * MS, 0, 7, 3, 2500, True, 40.5),
     FrameShown(3002 * MS, 1, 2, 3000 * MS, 0),
     FrameKept(3002 * MS, "jpeg", b"\xff\xd8"),
+    TargetSeen(3002 * MS, (3.0, 0.0, 1.5), 0.1, 3.0, True),
     Perceived(3002 * MS, 3001 * MS, 0, 0, 0, 1, 2, (1.0, 2.0, 3.0)),
 )
 RECORDS = [*world_records(150), *cloud_records(150, 1500 * MS), *SEEN]
