@@ -12,13 +12,14 @@ from cloudrc.errors import BadInputError
 
 VERBS = {
     "robot": "write a folder with a robot that flies, to change",
-    "perception": "write a file with a perception that drives by scans, to change",
+    "perception": "write a file with a perception that moves the robot by what it sees, to change",
 }
 EPILOG = """\
 examples:
   cloudrc new robot ./my_robot       robot.yaml, robot.xml and a test
   cloudrc robot check ./my_robot
-  cloudrc new perception ./my_perception.py"""
+  cloudrc new perception ./my_perception.py             drives by scans
+  cloudrc new perception ./my_perception.py --camera    flies by pictures"""
 
 
 def arguments(parser: Parser) -> None:
@@ -26,12 +27,15 @@ def arguments(parser: Parser) -> None:
     robot, perception = add_verbs(parser, VERBS).values()
     robot.add_argument("folder", type=Path, metavar="DIR", help="folder for the files")
     perception.add_argument("file", type=Path, metavar="FILE", help="Python file, NAME.py")
+    perception.add_argument(
+        "--camera", action="store_true", help="for a robot with a camera, in place of a scanner"
+    )
 
 
 def execute(options: Options) -> None:
     """Write the files, and print what to type next."""
     if options.verb == "perception":
-        _write_perception(options.file)
+        _write_perception(options.file, camera=options.camera)
         return
     from cloudrc.runs.new_robot import write_robot
 
@@ -46,19 +50,19 @@ def execute(options: Options) -> None:
     )
 
 
-def _write_perception(file: Path) -> None:
+def _write_perception(file: Path, *, camera: bool) -> None:
     from cloudrc.runs.new_perception import write_perception
 
     if file.suffix != ".py":
         raise BadInputError(f"{file}: name a Python file, such as {file}.py")
     if file.exists():
         raise BadInputError(f"{file}: exists already; name another file")
-    write_perception(file)
-    typed = _typed(file)
+    write_perception(file, camera=camera)
+    experiment, with_it = "follow" if camera else "gap", f"--set cloud.perception={_typed(file)}"
     print(
         f"change see() in {file}, then:\n"
-        f"  cloudrc run gap --mode virtual --set cloud.perception={typed}\n"
-        f"  cloudrc run gap --mode virtual --set cloud.perception={typed} --set link.profile=lte"
+        f"  cloudrc run {experiment} --mode virtual {with_it}\n"
+        f"  cloudrc run {experiment} --mode virtual {with_it} --set link.profile=lte"
     )
 
 

@@ -259,6 +259,7 @@ class RobotFacts:
     motion: PlugIn | None  # file of a better model, with the parameters of the onboard controller
     acceleration_max: float  # limit of the guard [m/s^2]
     speed_max: float  # likewise [m/s]
+    heading: Heading = "free"  # what decides about its heading
 
 
 def facts(
@@ -279,7 +280,7 @@ def facts(
     response = tuned.response if tuned and tuned.response else robot.response
     limit = acceleration_max or robot.guard.acceleration_max_mps2
     speed = speed_max or robot.guard.speed_max_mps or SPEED_MPS[1]
-    return RobotFacts(world.robot, response, motion, limit, speed)
+    return RobotFacts(world.robot, response, motion, limit, speed, robot.heading)
 
 
 def files_of(name: str) -> list[Path]:

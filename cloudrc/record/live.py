@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.messages import UPRIGHT, Quaternion, Vector
-from cloudrc.record.ros import STORE, header, pack, rotate, stamp_of, twist_of
+from cloudrc.record.ros import STORE, header, pack, stamp_of, twist_of
 from cloudrc.records import Control
+from cloudrc.rotation import rotate
 
 WORLD, BASE = "world", "base_link"
 """Frame of poses and of commanded velocities, and frame of the robot's base."""

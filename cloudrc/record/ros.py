@@ -27,6 +27,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 
 from cloudrc.messages import Quaternion, Vector
 from cloudrc.record.topics import TOPICS, Kind, Row, Topic, Values
+from cloudrc.rotation import rotate
 
 _OURS = "cloudrc_msgs/"
 SCAN, LIDAR = "sensor_msgs/msg/LaserScan", "lidar"
@@ -183,17 +184,6 @@ def shifted(data: bytes, offset_ns: int) -> bytes:
     return data[:_ENCAPSULATION] + moved + data[_ENCAPSULATION + stamp.size :]
 
 
-def rotate(orientation_wxyz: Quaternion, vector: Sequence[float]) -> Vector:
-    """Rotate a vector from the body frame to the world frame: v + 2 · u x (u x v + w · v).
-
-    `orientation_wxyz` is a unit quaternion (w, u), body to world, shape (4,); Rodrigues' formula.
-    """
-    w, x, y, z = orientation_wxyz
-    a, b, c = vector
-    p, q, r = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
-    return a + 2 * (y * r - z * q), b + 2 * (z * p - x * r), c + 2 * (x * q - y * p)
-
-
 def _parse_odometry(message: Any) -> Values:
     pose, twist = message.pose.pose, message.twist.twist
     turn = pose.orientation
@@ -286,10 +276,10 @@ def pack_scan(row: Row, frame: str = LIDAR) -> bytes:
     return pack(SCAN, header(stamp_ns, frame), *angles, 0.0, period, 0.0, range_max, *arrays)
 
 
-def pack_picture(row: Row) -> bytes:
-    """Encode a row of /camera as a sensor_msgs/CompressedImage."""
+def pack_picture(row: Row, frame: str = CAMERA) -> bytes:
+    """Encode a row of /camera as a sensor_msgs/CompressedImage whose camera has this frame."""
     stamp_ns, form, data = row
-    return pack(PICTURE, header(stamp_ns, CAMERA), form, np.frombuffer(data, np.uint8))
+    return pack(PICTURE, header(stamp_ns, frame), form, np.frombuffer(data, np.uint8))
 
 
 def _layout(kinds: Iterable[Kind]) -> str:

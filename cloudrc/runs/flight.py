@@ -57,7 +57,10 @@ def explain(error: BaseException) -> str:
 
 
 def measure(experiment: ResolvedExperiment) -> Row:
-    """Fly an experiment in virtual time and measure it."""
+    """Fly an experiment in virtual time and measure it; nobody will see its pictures again."""
+    if (camera := experiment.camera) is not None:
+        unkept = camera.model_copy(update={"keep": False})
+        experiment = experiment.model_copy(update={"camera": unkept})
     return row_of(fly_in_memory(experiment), experiment)
 
 

@@ -36,7 +36,43 @@ def build(width: int = 12, ahead: float = 1.5) -> MostRoom:
     return MostRoom(width, ahead)
 '''
 
+OF_CAMERA = '''\
+"""Perception: turns towards the reddest part of the picture."""
 
-def write_perception(file: Path) -> None:
-    """Write a perception to a new `file`."""
-    write_atomically(file, PERCEPTION.encode())
+from math import atan, tan
+
+import numpy as np
+
+from cloudrc.cloud.perceptions import Frame, Perception, yaw_of
+from cloudrc.messages import Odometry, Setpoint
+
+
+class Reddest(Perception):
+    takes = "camera"
+
+    def __init__(self, threshold: int, height: float) -> None:
+        self.threshold, self.height = threshold, height
+
+    def see(self, seen: Frame, odometry: Odometry) -> Setpoint | None:
+        # seen.image: red, green, blue, shape (height, width, 3); row 0 is the highest.
+        # odometry is the robot's when the picture was taken, which is some time ago.
+        image = seen.image.astype(int)
+        redness = image[..., 0] - image[..., 1:].max(axis=2)
+        rows, columns = np.nonzero(redness > self.threshold)
+        if len(columns) < 10:
+            return None  # the last setpoint stays
+        height, width = redness.shape
+        focal = height / 2 / tan(seen.fovy / 2)  # points of the picture per tangent of the angle
+        left = atan((width / 2 - columns.mean()) / focal)
+        x, y, _ = odometry.position
+        return Setpoint((x, y, self.height), yaw_of(odometry) + left, turns=True)
+
+
+def build(threshold: int = 80, height: float = 1.5) -> Reddest:
+    return Reddest(threshold, height)
+'''
+
+
+def write_perception(file: Path, *, camera: bool = False) -> None:
+    """Write a perception to a new `file`: for scans, or for the pictures of a `camera`."""
+    write_atomically(file, (OF_CAMERA if camera else PERCEPTION).encode())

@@ -4,12 +4,19 @@
 
 import pytest
 
+from tests.support.camera import needs_renderer
 
-def test_a_new_perception_drives_the_corridor(tmp_path, monkeypatch, call):
+
+@pytest.mark.parametrize(
+    ("experiment", "option"),
+    [("gap", ""), pytest.param("follow", "--camera", marks=needs_renderer)],
+)
+def test_a_new_perception_moves_the_robot(tmp_path, monkeypatch, call, experiment, option):
     monkeypatch.chdir(tmp_path)
-    said = call("new perception mine.py").out
-    assert "cloud.perception=./mine.py" in said
-    flown = call("run gap --mode virtual --set cloud.perception=./mine.py --report none --out run")
+    said = call(f"new perception mine.py {option}").out
+    mine = f"run {experiment} --mode virtual --set cloud.perception=./mine.py"
+    assert mine in said
+    flown = call(f"{mine} --report none --out run")
     assert "SUCCESS" in flown.out
     assert "perception_failed" not in flown.out
 

@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from cloudrc.cloud import controllers, estimators, perceptions, predictors
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
-from cloudrc.cloud.perceptions import Perception, Scan
+from cloudrc.cloud.perceptions import Frame, Perception, Scan
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.config.overrides import OUTSIDE
 from cloudrc.config.robot import facts
 from cloudrc.config.schema import World
 from cloudrc.messages import UPRIGHT, ZERO, Command, Odometry, Setpoint
 
-PELICAN = facts(World(), 12.0)
+PELICAN, X2 = facts(World(), 12.0), facts(World(robot="x2"), 4.0)
 KINDS = {
     estimators: Estimator,
     predictors: Predictor,
@@ -76,9 +76,10 @@ def are_finite(*values):
 
 
 def build(module):
-    """Build a plug-in with its defaults, for the Pelican."""
+    """Build a plug-in with its defaults, for the Pelican; a perception for x2, which turns."""
     takes = "robot" in inspect.signature(module.build).parameters
-    return module.build(**({"robot": PELICAN} if takes else {}))
+    robot = X2 if "perceptions" in module.__name__ else PELICAN
+    return module.build(**({"robot": robot} if takes else {}))
 
 
 @every_plugin
@@ -216,18 +217,35 @@ scans = st.integers(2, 541).flatmap(
         st.one_of(st.floats(0.001, 60.0), st.just(inf)), min_size=rays, max_size=rays
     )
 )
+images = st.builds(
+    lambda rows, columns, seed: np.random.default_rng(seed).choice(
+        np.array([(230, 26, 20), (0, 0, 0), (255, 255, 255), (90, 120, 60)], np.uint8),
+        (rows, columns),
+    ),
+    *(st.integers(16, 60), st.integers(16, 80), st.integers(0, 99)),
+)
+
+
+def frame(stamp_ns, image):
+    """Return an image whose left half has one colour."""
+    image[:, : image.shape[1] // 2] = image[0, 0]
+    return Frame(stamp_ns, 3, image, 1.0)
 
 
 @every_perception
-@given(ranges=scans, fov=st.floats(0.1, 2 * pi), sample=odometry)
+@given(ranges=scans, fov=st.floats(0.1, 2 * pi), image=images, sample=odometry)
 @fewer
-def test_a_setpoint_is_finite_and_equal_scans_give_equal_ones(module, ranges, fov, sample):
+def test_a_setpoint_is_finite_and_equal_things_seen_give_equal_ones(
+    module, ranges, fov, image, sample
+):
     """Also where nothing is within range, or something on all sides."""
     angles = np.linspace(-fov / 2, fov / 2, len(ranges))
     scan = Scan(sample.stamp_ns, np.array(ranges), angles)
-    before = scan.ranges.copy()
-    first, again = (build(module).see(scan, sample) for _ in range(2))
-    assert (scan.ranges == before).all(), "others may use the scan, too"
+    seen = scan if build(module).takes == "scan" else frame(sample.stamp_ns, image)
+    values = seen.ranges if seen is scan else seen.image
+    before = values.copy()
+    first, again = (build(module).see(seen, sample) for _ in range(2))
+    assert (values == before).all(), "others may use it, too"
     assert first == again
     if first is not None:
         assert are_finite(first.position, first.velocity, (first.yaw, first.yaw_rate))
@@ -236,12 +254,19 @@ def test_a_setpoint_is_finite_and_equal_scans_give_equal_ones(module, ranges, fo
 @every_perception
 def test_a_perception_forgets_everything_when_it_is_reset(module):
     used, fresh = build(module), build(module)
-    angles = np.linspace(-2.0, 2.0, 9)
+
+    def seen(k, sample, far):
+        if used.takes == "scan":
+            return Scan(sample.stamp_ns, np.linspace(1.0, far, 9), np.linspace(-2.0, 2.0, 9))
+        image = np.zeros((60, 80, 3), np.uint8)
+        image[20 : 40 - k, 10 + k : 40] = 230, 26, 20
+        return frame(sample.stamp_ns, image)
+
     for k in range(10):
         sample = Odometry(k * 10**8, (0.1 * k, 0.0, 0.0), UPRIGHT, ZERO, ZERO)
-        used.see(Scan(sample.stamp_ns, np.full(9, 1.0 + k), angles), sample)
+        used.see(seen(k, sample, 1.0 + k), sample)
     used.reset()
     for k in range(3):
         sample = Odometry(k * 10**8, ZERO, UPRIGHT, ZERO, ZERO)
-        scan = Scan(sample.stamp_ns, np.linspace(1.0, 5.0 + k, 9), angles)
-        assert used.see(scan, sample) == fresh.see(scan, sample)
+        again = seen(k, sample, 5.0 + k)
+        assert used.see(again, sample) == fresh.see(again, sample)

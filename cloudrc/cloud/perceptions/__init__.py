@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import Odometry, Setpoint, Vector
+from cloudrc.rotation import rotate
 
 
 class Scan(NamedTuple):
@@ -48,6 +49,12 @@ def point_at(odometry: Odometry, angle: float, distance: float) -> Vector:
     """Return the place [m], world frame, that the robot sees at an angle [rad] and distance [m]."""
     (x, y, z), heading = odometry.position, yaw_of(odometry) + angle
     return (x + distance * cos(heading), y + distance * sin(heading), z)
+
+
+def place_of(odometry: Odometry, point: Vector) -> Vector:
+    """Return the place [m], world frame, of a `point` in the robot's frame [m]: ahead, left, up."""
+    (x, y, z), (a, b, c) = odometry.position, rotate(odometry.orientation_wxyz, point)
+    return x + a, y + b, z + c
 
 
 class Perception:
