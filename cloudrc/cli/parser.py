@@ -30,6 +30,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "replay": "watch a recorded flight in 3-D, in a browser",
         "report": "write the report of a recorded run again",
         "timeline": "show where the age of the commands comes from, stage by stage",
+        "see": "let a perception look again at what a recorded flight saw",
         "recover": "write a clean copy of a damaged recording",
     },
     "links": {

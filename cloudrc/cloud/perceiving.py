@@ -58,6 +58,29 @@ class Here:
         return outcome
 
 
+def judge(result: Any, low: Vector, high: Vector) -> Setpoint:
+    """Return the setpoint that a perception made, in the box from `low` to `high` [m].
+
+    Raises:
+        InvalidValueError: If it is none, or has numbers that are not finite.
+    """
+    if not isinstance(result, Setpoint):
+        raise InvalidValueError(f"its result is {shorten(result)}, not a Setpoint")
+    x, y, z = (
+        min(max(value, least), most)
+        for value, least, most in zip(
+            to_vector(result.position, "position"), low, high, strict=True
+        )
+    )
+    return Setpoint(
+        (x, y, z),
+        RESULT.of(result.yaw, "yaw"),
+        velocity=to_vector(result.velocity, "velocity"),
+        turns=bool(result.turns),
+        yaw_rate=RESULT.of(result.yaw_rate, "yaw rate"),
+    )
+
+
 class _Look(NamedTuple):
     """Something seen, at which the perception looks or is about to."""
 
@@ -199,29 +222,7 @@ class Perceiver:
         if reset:
             self._perception.reset()
         result = self._perception.see(seen, odometry)
-        return None if result is None else self._judge(result)
-
-    def _judge(self, result: Any) -> Setpoint:
-        """Return the setpoint that a perception made, inside the fence, if its numbers are finite.
-
-        Raises:
-            InvalidValueError: If it is none, or has others.
-        """
-        if not isinstance(result, Setpoint):
-            raise InvalidValueError(f"its result is {shorten(result)}, not a Setpoint")
-        x, y, z = (
-            min(max(value, low), high)
-            for value, low, high in zip(
-                to_vector(result.position, "position"), self._low, self._high, strict=True
-            )
-        )
-        return Setpoint(
-            (x, y, z),
-            RESULT.of(result.yaw, "yaw"),
-            velocity=to_vector(result.velocity, "velocity"),
-            turns=bool(result.turns),
-            yaw_rate=RESULT.of(result.yaw_rate, "yaw rate"),
-        )
+        return None if result is None else judge(result, self._low, self._high)
 
     def _finish(self, look: _Look, outcome: Outcome, now_ns: int) -> None:
         """Take over the setpoint of a look that is over, unless another mission flies."""
