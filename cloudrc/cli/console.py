@@ -20,7 +20,7 @@ from cloudrc.cli.where import (
     run_argument,
 )
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
-from cloudrc.teleop.client import Api
+from cloudrc.teleop.client import UNIX, Api
 
 if TYPE_CHECKING:
     from cloudrc.console.page import Page
@@ -113,7 +113,13 @@ def _local(options: Options) -> ConsoleTarget:
     link = LinkControl(
         read, lambda settings: set_here(run / LINK_FOLDER, url, None, settings, token_hex(4))
     )
-    return ConsoleTarget(run / "config.yaml", Api(url), link, lambda: under_way().get(run) != url)
+    return ConsoleTarget(
+        run / "config.yaml",
+        Api(url),
+        link,
+        lambda: under_way().get(run) != url,
+        records=Path(url.removeprefix(UNIX)).parent if url.startswith(UNIX) else None,
+    )
 
 
 def _in_pod(options: Options) -> ConsoleTarget:

@@ -123,10 +123,11 @@ def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any
     name = options.namespace.strip("/")
     frames = RobotFrames(f"{name}/" if name else "", options.rep_105)
     bodies = read_shapes(world)
-    markers = encode_markers(0, scene_shapes(bodies, scene_of(world).tubes, frames.prefix))
+    markers = encode_markers(0, scene_shapes(bodies, scene_of(world), frames.prefix))
     description = urdf(world.robot, frames, bodies.robot)
     exactness, navigates = covariances(world.sensors), not options.no_navigation
-    shown = Shown(frames, markers, description, exactness, navigates, bodies.scanner)
+    sensors = bodies.scanner, bodies.camera
+    shown = Shown(frames, markers, description, exactness, navigates, *sensors)
 
     def tell(text: str) -> None:
         print_line(f"ros: {text}")

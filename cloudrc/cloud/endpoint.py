@@ -25,6 +25,7 @@ from cloudrc.cloud.operator import (
     make_robot_status,
 )
 from cloudrc.cloud.perceiving import Perceiver
+from cloudrc.cloud.perceptions import Frame
 from cloudrc.cloud.receiving import FrameReceiver
 from cloudrc.errors import ControllerLostError
 from cloudrc.messages import (
@@ -89,7 +90,13 @@ class CloudEndpoint(TunnelEnd):
         telemetry: The newest telemetry; None before the first.
         watch: Is called with epoch, counter and content of each telemetry that cloud uses.
         watch_scan: Is called likewise with each scan.
+        watch_frame: Is called with each picture.
     """
+
+    telemetry: Telemetry | None = None
+    watch: Callable[[int, int, Telemetry], None] | None = None
+    watch_scan: Callable[[int, int, RangeScan], None] | None = None
+    watch_frame: Callable[[Frame], None] | None = None
 
     def __init__(
         self,
@@ -122,12 +129,9 @@ class CloudEndpoint(TunnelEnd):
         self._handshake = ClientHandshake(identity.nonce, identity.clock_id)
         self._hellos = 0
         self._setpoint: Setpoint | None = None
-        self._perceiver, self._scan_channel = perceiver, ReceiveWindow(newest_wins=True)
-        self._frames = frames
+        self._perceiver, self._frames = perceiver, frames
+        self._scan_channel = ReceiveWindow(newest_wins=True)
         self._world = ""  # identifies the world process of the session
-        self.telemetry: Telemetry | None = None
-        self.watch: Callable[[int, int, Telemetry], None] | None = None
-        self.watch_scan: Callable[[int, int, RangeScan], None] | None = None
         self._control: Control | None = None  # record of the session's last command
         self._uplink_delay = nan  # of the newest telemetry [s]
         self._alarm = EmergencyStopRepeater()
@@ -378,6 +382,8 @@ class CloudEndpoint(TunnelEnd):
         if self._frames is None:
             return
         for frame in self._frames.receive(piece, now_ns):
+            if self.watch_frame is not None:
+                self.watch_frame(frame)
             if self._perceiver is not None:
                 self._perceiver.receive_frame(frame, now_ns)
         self._records += self._frames.take_records()

@@ -37,6 +37,7 @@ from cloudrc.console.steering import Steering, is_drive
 from cloudrc.geometry.clearance import Array
 from cloudrc.messages import ZERO, Quaternion, Vector
 from cloudrc.metrics.definitions import CHARTED
+from cloudrc.pictures import Image
 from cloudrc.report.scene import LEGEND, FlightScene
 from cloudrc.robots.shapes import read_shapes
 from cloudrc.teleop.client import describe_mission
@@ -115,6 +116,7 @@ class Page:
         self._controls: Controls | None = None
         self._due = -inf  # time of the next slow update [s]
         self._drawn = 0  # number of drawn points of the trail
+        self._picture: viser.GuiImageHandle | None = None
         scene, shapes = scene_of(experiment.world), read_shapes(experiment.world)
         self._scene = FlightScene(self._server, experiment, shapes, scene, ASPECT)
         self._add_panels(with_legend=bool(scene.tubes))
@@ -161,6 +163,16 @@ class Page:
         if controls := self._controls:
             controls.update(now)
 
+    def show_picture(self, image: Image) -> None:
+        """Show a picture of the robot's camera, above the charts."""
+        if self._picture is not None:
+            self._picture.image = image
+            return
+        with self._charts_tab:
+            self._picture = self._server.gui.add_image(
+                image, label="camera, as cloud has it", format="jpeg", order=-1
+            )
+
     def close(self) -> None:
         """Stop serving the page."""
         self._door.stop()
@@ -176,7 +188,8 @@ class Page:
         if with_legend:
             gui.add_html(LEGEND, order=2.5)
         panel = gui.add_panel()
-        with panel.add_tab("Charts"):
+        self._charts_tab = panel.add_tab("Charts")
+        with self._charts_tab:
             self._charts = [_add_chart(gui, title) for title in CHARTS]
         panel.dock_left()
         panel.set_width(PANEL_WIDTH)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import scene_of
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import Page
+from cloudrc.console.pictures import PictureFeed
 from cloudrc.console.steering import LinkControl, Steering
 from cloudrc.errors import CloudrcError
 from cloudrc.geometry.obstacles import has_surface, obstacles
@@ -39,6 +40,7 @@ class ConsoleTarget(NamedTuple):
     has_ended: Callable[[], bool]
     token: Callable[[], str] | None = None  # of the page; None: a new one, which is printed
     robot: int | None = None  # number in a fleet
+    records: Path | None = None  # folder of the sockets of cloud's records; None: no pictures
 
     def experiment(self) -> ResolvedExperiment:
         """Read the experiment of the robot."""
@@ -71,12 +73,17 @@ def serve(
         steering.watch()
         steering.start()
         ready(page)
+        pictures = None
+        if experiment.camera is not None and flight.records is not None:
+            pictures = opened.enter_context(closing(PictureFeed(flight.records)))
         due = 0.0
         while not flight.has_ended():
             with suppress(CloudrcError):  # teleop starts or ends; the page says what is wrong
                 for status in flight.api.robot():
                     now = time.monotonic()
                     feed.take(status, now)
+                    if pictures is not None and (picture := pictures.take(status)) is not None:
+                        page.show_picture(picture)
                     if now >= due:  # drawing takes half of the time: no old statuses queue up
                         page.update(now)
                         due = 2 * time.monotonic() - now

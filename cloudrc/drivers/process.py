@@ -12,6 +12,7 @@ import json
 import os
 import signal
 import time
+from base64 import b64decode, b64encode
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ from cloudrc.records import (
     Control,
     Counted,
     Fault,
+    FrameKept,
     GuardChange,
     LinkChanged,
     MissionEvent,
@@ -206,8 +208,13 @@ class Feed:
 
 
 def to_line(record: Record) -> str:
-    """Format a record as one line of JSON: a list of the type's name and the fields' values."""
-    return json.dumps([type(record).__name__, record])
+    """Format a record as one line of JSON: a list of the type's name and the fields' values.
+
+    Bytes become text in base64.
+    """
+    return json.dumps(
+        [type(record).__name__, record], default=lambda data: b64encode(data).decode()
+    )
 
 
 def in_words(event: GuardChange | MissionEvent | Fault | LinkChanged) -> str:
@@ -225,6 +232,8 @@ def in_words(event: GuardChange | MissionEvent | Fault | LinkChanged) -> str:
 def from_line(line: str) -> Record:
     """Parse a line from `to_line`."""
     name, values = json.loads(line)
+    if name == FrameKept.__name__:
+        values[-1] = b64decode(values[-1])
     return _kind(name).validate_python(values)
 
 

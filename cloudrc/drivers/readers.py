@@ -15,14 +15,15 @@ from __future__ import annotations
 import os
 import select
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 from cloudrc.drivers.process import from_line, to_line
 from cloudrc.drivers.teleop import bind_datagrams
 from cloudrc.link.carry.datagrams import receive_all, send_or_lose
 from cloudrc.messages import Telemetry
-from cloudrc.records import Record, TelemetrySent
+from cloudrc.pictures import Image, Jpeg
+from cloudrc.records import FrameKept, Record, TelemetrySent
 
 CLOUD = "records.sock"
 """Name of cloud's socket."""
@@ -32,6 +33,10 @@ LOOK_NS = 500_000_000
 """Time between two looks for readers [ns]."""
 SIZE_MAX = 60_000
 """Size above which the records of a period are sent in several datagrams [bytes]."""
+PICTURE_MAX = 40_000
+"""Size of a picture above which a smaller one is sent [bytes]: in base64, it is a third larger."""
+SHOWN_QUALITY = 80
+"""Quality of JPEG in which pictures are sent."""
 DATAGRAM_MAX = 2 * SIZE_MAX
 """Size limit of a datagram [bytes]: a single record is smaller than `SIZE_MAX`."""
 
@@ -54,14 +59,29 @@ class RecordSender:
         if self._sent:
             self._send([to_line(record)])
 
+    def show_picture(self, stamp_ns: int, image: Image) -> None:
+        """Send a picture that cloud has, with the stamp of the time at which it was taken [ns].
+
+        One that is too large for a datagram is sent with every second point, and so on.
+        """
+        if self._sent:
+            coder = Jpeg(SHOWN_QUALITY)
+            while len(data := coder.encode(image).data) > PICTURE_MAX:
+                image = image[::2, ::2]
+            self._send([to_line(FrameKept(stamp_ns, "jpeg", data))])
+
     def put(self, records: Iterable[Record]) -> None:
-        """Send records, oldest first; look for new readers now and then."""
+        """Send records, oldest first; look for new readers now and then.
+
+        Pictures that are kept are left out: `show_picture` has sent them.
+        """
         if (now_ns := time.monotonic_ns()) >= self._due_ns:
             self._due_ns = now_ns + LOOK_NS
             found = self._folder.glob(READERS)
             self._sent = {path: self._sent.get(path, 0) for path in found}
         if self._sent:
-            for lines in _parts(map(to_line, records)):
+            told = (record for record in records if type(record) is not FrameKept)
+            for lines in _parts(map(to_line, told)):
                 self._send(lines)
 
     def close(self) -> None:
@@ -82,8 +102,12 @@ class RecordReader:
         dropped: Number of records that were lost because this program was too slow.
     """
 
-    def __init__(self, folder: Path) -> None:
-        """Begin to receive; `folder` has the sockets of cloud and its readers."""
+    def __init__(self, folder: Path, kinds: Collection[type[Record]] = ()) -> None:
+        """Begin to receive; `folder` has the sockets of cloud and its readers.
+
+        Of the records, those of `kinds` alone are read; (): all.
+        """
+        self._heads = tuple(f'["{kind.__name__}"' for kind in kinds)
         self._path = folder / f"r{os.getpid()}.sock"
         self._cloud = str(folder / CLOUD)
         self._socket = bind_datagrams(self._path)
@@ -111,7 +135,7 @@ class RecordReader:
         before = int(number)
         self.dropped += max(0, before - self._next)
         self._next = before + len(lines)  # a new process of cloud counts from 0
-        return [from_line(line) for line in lines]
+        return [from_line(line) for line in lines if line.startswith(self._heads or "")]
 
 
 def _parts(lines: Iterable[str]) -> Iterator[list[str]]:

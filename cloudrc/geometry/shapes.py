@@ -33,6 +33,8 @@ _UNREADABLE = (
     *(OSError, EOFError, BadZipFile, zlib.error),
 )
 """What reading a damaged attachment raises."""
+SENSORS = ("scanner", "camera")
+"""Sensors of a robot whose poses belong to its shapes."""
 SIDES = 20
 """Number of corners of a circle; a multiple of 4."""
 
@@ -66,6 +68,7 @@ class Shapes:
     scene: tuple[Surface, ...] = ()  # without infinite planes
     planar: bool = False  # whether the robot stays on the ground
     scanner: Pose | None = None  # of the robot's scanner, in the frame of the base
+    camera: Pose | None = None  # of its camera, likewise: x to the right, y down, z ahead
 
     @staticmethod
     def of(surfaces: Sequence[Surface], planar: bool) -> Shapes:
@@ -85,8 +88,9 @@ class Shapes:
         """Return the content of a file, which `from_bytes` reads; equal shapes give equal bytes."""
         surfaces = [*self.robot, *self.scene]
         file, more = BytesIO(), dict[str, Any]()
-        if self.scanner is not None:  # robots without one keep their bytes
-            more["scanner"] = np.array([*self.scanner[0], *self.scanner[1]])
+        for name in SENSORS:
+            if pose := getattr(self, name):  # robots without one keep their bytes
+                more[name] = np.array([*pose[0], *pose[1]])
         np.savez_compressed(
             file,
             **more,
@@ -127,11 +131,12 @@ def _read(file: dict[str, NDArray[Any]]) -> Shapes:
         )
     ]
     shapes = Shapes.of(found, bool(file["planar"]))
-    if "scanner" not in file:
-        return shapes
-    x, y, z, *turn = file["scanner"].astype(float).tolist()
-    a, b, c, d = turn
-    return replace(shapes, scanner=((x, y, z), (a, b, c, d)))
+    poses = dict[str, Pose]()
+    for name in SENSORS:
+        if name in file:
+            x, y, z, a, b, c, d = file[name].astype(float).tolist()
+            poses[name] = (x, y, z), (a, b, c, d)
+    return replace(shapes, scanner=poses.get("scanner"), camera=poses.get("camera"))
 
 
 def _fan(polygons: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -41,7 +41,8 @@ def main(folder: Path, port: int) -> None:
         socket = Path(under_way()[folder].removeprefix("unix:"))
         world = read_experiment(str(folder / "config.yaml")).world
         shapes = read_shapes(world)
-        views = LiveViews(scene_shapes(shapes, scene_of(world).tubes), shapes.scanner)
+        bodies = scene_shapes(shapes, scene_of(world))
+        views = LiveViews(bodies, shapes.scanner, shapes.camera)
         reader = RecordReader(socket.parent)
         stack.callback(reader.close)
         try:

@@ -10,9 +10,16 @@ from cloudrc.geometry.shapes import Pose
 from cloudrc.messages import GuardState
 from cloudrc.record.content import Message
 from cloudrc.record.live import BASE, encode_transforms, frames_of
-from cloudrc.record.ros import LIDAR, encode
+from cloudrc.record.ros import CAMERA, LIDAR, encode
 from cloudrc.record.topics import TOPICS, topics_of
-from cloudrc.records import Control, GuardChange, Record, ScanTaken, TelemetrySent
+from cloudrc.records import (
+    Control,
+    FrameKept,
+    GuardChange,
+    Record,
+    ScanTaken,
+    TelemetrySent,
+)
 from cloudrc.report.markers import MarkerShape, encode_markers
 
 REPEAT_NS = 1_000_000_000
@@ -25,9 +32,15 @@ class LiveViews:
     Of the robot, cloud knows what telemetry says: the frame `base_link` is its measured pose.
     """
 
-    def __init__(self, shapes: Sequence[MarkerShape], scanner: Pose | None = None) -> None:
-        """Set the bodies of /scene, and the pose of the scanner in the frame of the base."""
-        self._shapes, self._scanner = shapes, scanner
+    def __init__(
+        self,
+        shapes: Sequence[MarkerShape],
+        scanner: Pose | None = None,
+        camera: Pose | None = None,
+    ) -> None:
+        """Set the bodies of /scene, and the poses of the sensors in the frame of the base."""
+        self._shapes = shapes
+        self._sensors = {ScanTaken: (LIDAR, scanner), FrameKept: (CAMERA, camera)}
         self._guard: GuardState | None = None
         self._repeated_ns = -REPEAT_NS
 
@@ -38,9 +51,11 @@ class LiveViews:
             yield topic.name, row[0], encode(topic, row)
         if isinstance(record, TelemetrySent):
             yield from self._of_telemetry(record)
-        elif isinstance(record, ScanTaken) and self._scanner is not None:
+        elif isinstance(record, ScanTaken | FrameKept):
+            frame, pose = self._sensors[type(record)]
             stamp_ns = record.stamp_ns
-            yield "/tf", stamp_ns, encode_transforms(stamp_ns, {LIDAR: self._scanner}, BASE)
+            if pose is not None:
+                yield "/tf", stamp_ns, encode_transforms(stamp_ns, {frame: pose}, BASE)
         elif isinstance(record, Control):
             yield "/tf", record.stamp_ns, encode_transforms(record.stamp_ns, frames_of(record))
 

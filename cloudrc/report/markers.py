@@ -3,17 +3,18 @@
 """Make ROS markers of the robot, its surroundings and paths, as RViz and Foxglove show them.
 
 A marker moves with its frame: the robot with `base_link`, the robot that cloud predicts with
-`estimate`, the ball at the setpoint with `setpoint`. The scene has the frame `world`.
+`estimate`, the ball at the setpoint with `setpoint`. The scene has the frame `world`; a body of it
+that moves has its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from cloudrc.geometry.scene import Tube
+from cloudrc.geometry.scene import Scene
 from cloudrc.geometry.shapes import Shapes, Surface
 from cloudrc.geometry.tubes import wall
 from cloudrc.record.ros import header, pack
@@ -32,20 +33,26 @@ GOAL_SIZE = 0.12
 """Largest diameter of the setpoint's ball [m]; that of a small robot is smaller."""
 
 
-def scene_shapes(bodies: Shapes, tubes: Sequence[Tube], prefix: str = "") -> list[MarkerShape]:
+def scene_shapes(bodies: Shapes, geometry: Scene, prefix: str = "") -> list[MarkerShape]:
     """Make the shapes of the robot, the predicted robot, the setpoint and the scene.
 
-    `tubes` are the tubes among the bodies of the scene. `prefix` precedes the names of the robot's
-    frames.
+    `geometry` tells which bodies of the scene are tubes, and which move: these have frames of their
+    own. `prefix` precedes the names of the robot's frames.
     """
-    size, names = bodies.size / 4 or GOAL_SIZE, {tube.name for tube in tubes}
+    size, names = bodies.size / 4 or GOAL_SIZE, {tube.name for tube in geometry.tubes}
     scene = [each for each in bodies.scene if each.body not in names]
-    scene += [wall(tube, GLASS, 24) for tube in tubes]
+    scene += [wall(tube, GLASS, 24) for tube in geometry.tubes]
+    moving = {each.name: np.negative(each.path[0]) for each in geometry.moving}
     return [
         *(_solid("robot", f"{prefix}base_link", part, part.rgba) for part in bodies.robot),
         *(_solid("estimate", f"{prefix}estimate", part, GHOST) for part in bodies.robot),
         ("setpoint", SPHERE, f"{prefix}setpoint", min(GOAL_SIZE, size), GOAL),
-        *(_solid(surface.body, "world", surface, surface.rgba) for surface in scene),
+        *(
+            _solid(each.body, each.body, each.placed(moving[each.body], np.eye(3)), each.rgba)
+            if each.body in moving
+            else _solid(each.body, "world", each, each.rgba)
+            for each in scene
+        ),
     ]
 
 

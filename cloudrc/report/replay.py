@@ -87,6 +87,8 @@ def _record(server: viser.ViserServer, flight: Flight, experiment: ResolvedExper
         fresh = ghost >= 0 and now - flight.seconds(applied["stamp_ns"][ghost]) < STALE
         pose = applied["position"], applied["orientation_wxyz"]
         scene.move("ghost", *(column[ghost] if fresh else None for column in pose))
+        for each in flight.scene.moving:
+            scene.move(each.name, each.at(float(now)))
         scene.move("setpoint", control["setpoint"][asked[frame]] if asked[frame] >= 0 else None)
         if not frame or reached[frame] != reached[frame - 1]:
             scene.set_waypoints(points, int(reached[frame]))

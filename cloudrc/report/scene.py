@@ -77,7 +77,6 @@ class FlightScene:
         self._scene = server.scene
         # Without a graphics card, shadows cost more than ten times the rest of a picture.
         self._scene.configure_default_lights(cast_shadow=False)
-        self._add_surroundings(shapes, geometry)
         scale = min(shapes.size / USUAL, 1.0) if shapes.robot else 1.0
         self._point_radius = POINT_RADIUS * scale
         add = self._scene.add_frame
@@ -88,6 +87,9 @@ class FlightScene:
                 "/setpoint", GOAL_RADIUS * scale, SETPOINT, opacity=0.6, visible=False
             ),
         }
+        for each in geometry.moving:
+            self._bodies[each.name] = add(f"/{each.name}", show_axes=False, visible=False)
+        self._add_surroundings(shapes, geometry)
         self._add_meshes("/robot", shapes.robot)
         self._add_meshes("/ghost", shapes.robot, GLASS)
         self._waypoints: list[Any] = []  # spheres
@@ -104,11 +106,11 @@ class FlightScene:
     def move(
         self, body: str, position: Vector | Array | None, orientation_wxyz: Array | None = None
     ) -> None:
-        """Move "robot", "ghost" (the predicted robot) or "setpoint"; position None hides the body.
+        """Move "robot", "ghost" (the predicted robot), "setpoint" or a moving body of the scene.
 
         Args:
-            body: One of the three names.
-            position: Position of the base [m], shape (3,).
+            body: Its name.
+            position: Position of the base [m], shape (3,); None hides the body.
             orientation_wxyz: Unit quaternion, body to world, shape (4,); None keeps the last one.
         """
         node = self._bodies[body]
@@ -177,6 +179,9 @@ class FlightScene:
         for surface in shapes.scene:
             if surface.body not in tubes:
                 bodies[surface.body].append(surface)
+        for each in geometry.moving:
+            back = np.negative(each.path[0])
+            bodies[each.name] = [part.placed(back, np.eye(3)) for part in bodies[each.name]]
         for name, surfaces in bodies.items():
             self._add_meshes(f"/{name}", surfaces)
         for tube in geometry.tubes:

@@ -4,8 +4,9 @@
 
 Each moving thing is a frame on `/tf`: `base_link` is the robot's true pose, `estimate` the pose
 that cloud predicted, `setpoint` the position that the controller tracks, `lidar` the scanner, where
-`/scan` was measured. `/scene` has one message: a marker for each body. A marker moves with its
-frame; the scene has the frame `world`.
+`/scan` was measured, `camera` the camera (x to the right, z ahead). `/scene` has one message: a
+marker for each body. A marker moves with its frame; the scene has the frame `world`, and a body of
+it that moves its own.
 
 `estimate` and `setpoint` have the stamps of `/estimated_odometry`. Each stamp is the time at which
 cloud sent a command.
@@ -23,7 +24,7 @@ from cloudrc.metrics.flight import Array, Columns, select
 from cloudrc.record.columns import Recording
 from cloudrc.record.content import Message
 from cloudrc.record.live import BASE, encode_transforms
-from cloudrc.record.ros import LIDAR, pack
+from cloudrc.record.ros import CAMERA, LIDAR, pack
 from cloudrc.record.topics import VIEWS
 from cloudrc.report.flown import flight_of, flown_shapes
 from cloudrc.report.markers import encode_markers, path_shape, scene_shapes
@@ -42,13 +43,19 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]
     poses, control = _thin(truth.columns), _thin(flight.control)
     first_ns = int(truth["stamp_ns"][0])
     bodies, shown = flown_shapes(recording, experiment), list[Message]()
-    shapes = scene_shapes(bodies, flight.scene.tubes)
+    shapes = scene_shapes(bodies, flight.scene)
     if len(path := poses["position"]) > 1:
         shapes.append(path_shape("path", path))
-    if (scanner := bodies.scanner) is not None:
-        for stamp_ns in recording["/scan"]["stamp_ns"].tolist():
-            lidar = encode_transforms(stamp_ns, {LIDAR: scanner}, BASE)
-            shown.append(("/tf", stamp_ns, lidar))
+    target = _thin(recording["/target"].columns)
+    for body in flight.scene.moving:
+        shown += _transforms(target, **{body.name: ("position", "")})
+    for topic, frame, pose in (
+        ("/scan", LIDAR, bodies.scanner),
+        ("/camera", CAMERA, bodies.camera),
+    ):
+        if pose is not None:
+            for stamp_ns in recording[topic]["stamp_ns"].tolist():
+                shown.append(("/tf", stamp_ns, encode_transforms(stamp_ns, {frame: pose}, BASE)))
     stamps_ns = flight.control["stamp_ns"]
     tracking = tracking_errors(flight, flight.true_position(stamps_ns))
     return [

@@ -22,7 +22,7 @@ def read_shapes(world: World) -> Shapes:
     with naming(f"robot {world.robot}"):
         model = compile_model(robot.model, file_of(world.scene))
         site = None if robot.scan is None else robot.scan.site
-        return shapes_of(model, planar=robot.planar, scan_site=site)
+        return shapes_of(model, planar=robot.planar, scan_site=site, camera=robot.camera)
 
 
 def flown_files(world: World) -> dict[str, bytes]:

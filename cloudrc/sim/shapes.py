@@ -6,15 +6,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cloudrc.geometry import shapes
 from cloudrc.geometry.scene import FLOOR
-from cloudrc.geometry.shapes import Rgba, Shapes, Surface
+from cloudrc.geometry.shapes import Pose, Rgba, Shapes, Surface
 from cloudrc.sim.engine import GEOM, at_rest, mujoco
-from cloudrc.sim.scene import bodies_of_geoms, find_part
+from cloudrc.sim.scene import bodies_of_geoms, find_camera, find_part
+
+if TYPE_CHECKING:
+    from cloudrc.config.camera import CameraConfig
 
 SHOWN = 3
 """Number of the first group of geoms that MuJoCo's viewers do not show: usually, geoms of groups
@@ -25,12 +28,14 @@ WIDE = 20.0
 """Half the edge of a plane without a size [m]."""
 
 
-def shapes_of(model: Any, *, planar: bool, scan_site: str | None = None) -> Shapes:
+def shapes_of(
+    model: Any, *, planar: bool, scan_site: str | None = None, camera: CameraConfig | None = None
+) -> Shapes:
     """Return the shapes of a compiled `MjModel` of a robot in a scene.
 
     Joints are at rest. Planes of the body `floor` are left out, because viewers draw the floor as a
     grid. `planar` tells whether the robot stays on the ground, `scan_site` names the site of its
-    scanner.
+    scanner, `camera` is the key of robot.yaml.
     """
     data, base = at_rest(model), model.jnt_bodyid[0]
     places, turns = data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3)
@@ -47,14 +52,22 @@ def shapes_of(model: Any, *, planar: bool, scan_site: str | None = None) -> Shap
         surface = surface.placed(places[geom], turns[geom])
         found.append(surface if body else surface.placed(-position @ axes, axes.T))
     shapes = Shapes.of(found, planar)
-    if scan_site is None:
-        return shapes
-    site = find_part(model, "site", scan_site, "scan.site")
-    turn = np.empty(4)
-    mujoco.mju_mat2Quat(turn, (axes.T @ data.site_xmat[site].reshape(3, 3)).ravel())
-    x, y, z = ((data.site_xpos[site] - position) @ axes).tolist()
-    a, b, c, d = turn.tolist()
-    return replace(shapes, scanner=((x, y, z), (a, b, c, d)))
+
+    def in_base(place: Any, turn: Any) -> Pose:
+        wxyz = np.empty(4)
+        mujoco.mju_mat2Quat(wxyz, (axes.T @ turn.reshape(3, 3)).ravel())
+        x, y, z = ((place - position) @ axes).tolist()
+        a, b, c, d = wxyz.tolist()
+        return (x, y, z), (a, b, c, d)
+
+    if scan_site is not None:
+        site = find_part(model, "site", scan_site, "scan.site")
+        shapes = replace(shapes, scanner=in_base(data.site_xpos[site], data.site_xmat[site]))
+    if camera is not None:
+        eye = find_camera(model, camera)
+        optical = data.cam_xmat[eye].reshape(3, 3) * (1.0, -1.0, -1.0)  # MuJoCo looks along -z
+        shapes = replace(shapes, camera=in_base(data.cam_xpos[eye], optical))
+    return shapes
 
 
 def _shown(model: Any, bodies: list[str]) -> list[int]:

@@ -16,6 +16,7 @@ from cloudrc.bridges.ros2.mission import MissionNews, Navigation
 from cloudrc.bridges.ros2.requests import RosRequests
 from cloudrc.config.disturbances import SensorsConfig
 from cloudrc.console.steering import Steering
+from cloudrc.geometry.scene import Scene
 from cloudrc.geometry.shapes import Shapes, Surface
 from cloudrc.messages import UPRIGHT, ZERO, GuardState
 from cloudrc.record.live import (
@@ -318,18 +319,20 @@ def test_ros_reads_health_guard_and_frames():
         (RobotFrames("a/", rep_105=True), {"a/odom": "map", "a/lidar": "a/base_link"}),
     ],
 )
-def test_the_scanner_is_at_rest_in_the_base_and_the_world_in_the_map(frames, parents):
+def test_scanner_and_camera_are_at_rest_in_the_base_and_the_world_in_the_map(frames, parents):
     pose = (0.1, 0.0, 0.2), UPRIGHT
     tree = frames.at_rest(pose)
     assert {child: parent for parent in tree for child in tree[parent]} == parents
     assert tree[frames.base][frames.lidar] == pose
     assert frames.base not in frames.at_rest(None)
+    assert frames.at_rest(None, pose)[frames.base] == {frames.camera: pose}
 
 
 def test_markers_move_with_the_robots_frames_and_the_scene_stays():
     corners, faces = np.eye(3), np.array([[0, 1, 2]], np.int32)
     bodies = Shapes((Surface("", corners, faces),), (Surface("box", corners, faces),))
-    shapes = [*scene_shapes(bodies, (), "drone1/"), path_shape("flown", [ZERO, (1.0, 0.0, 0.0)])]
+    path = path_shape("flown", [ZERO, (1.0, 0.0, 0.0)])
+    shapes = [*scene_shapes(bodies, Scene("empty"), "drone1/"), path]
     data = encode_markers(0, shapes)
     markers = STORE.deserialize_cdr(data, "visualization_msgs/msg/MarkerArray").markers
     assert [(marker.ns, marker.header.frame_id) for marker in markers] == [

@@ -18,6 +18,7 @@ from cloudrc.bridges.ros2.description import RobotFrames, urdf
 from cloudrc.bridges.ros2.requests import RosRequests
 from cloudrc.console.steering import Steering
 from cloudrc.drivers.readers import RecordReader, RecordSender
+from cloudrc.geometry.scene import Scene
 from cloudrc.geometry.shapes import Shapes
 from cloudrc.messages import ZERO
 from cloudrc.records import Lateness
@@ -107,7 +108,7 @@ def bridge(folder, said):
     frames = RobotFrames("drone1/", rep_105=True)
     robot = {"planar": False, "heading": "free", "frames": frames}
     requests = RosRequests(steering, said.append, **robot)
-    scene = encode_markers(0, scene_shapes(Shapes(), (), "drone1/"))
+    scene = encode_markers(0, scene_shapes(Shapes(), Scene("empty"), "drone1/"))
     shown = Shown(frames, scene, urdf("x2", frames, ()))
     node = RosBridge("drone1", shown, steering, requests, said.append)
     reader = RecordReader(folder)

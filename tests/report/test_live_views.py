@@ -6,7 +6,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from cloudrc.messages import UPRIGHT, GuardState
 from cloudrc.record.topics import VIEWS
-from cloudrc.records import ScanTaken
+from cloudrc.records import FrameKept, ScanTaken
 from cloudrc.report.live_views import REPEAT_NS, LiveViews
 from tests.support.told import told
 
@@ -46,3 +46,13 @@ def test_a_scan_comes_with_the_frame_of_its_scanner():
     assert (frame.header.frame_id, frame.child_frame_id) == ("base_link", "lidar")
     assert frame.transform.translation.x == 0.1
     assert topics(LiveViews([]), scan) == ["/scan"]
+
+
+def test_a_picture_comes_with_the_frame_of_its_camera():
+    views = LiveViews([], camera=((0.1, 0.0, 0.0), (0.5, -0.5, 0.5, -0.5)))
+    found = {topic: data for topic, _, data in views.of(FrameKept(5, "jpeg", b"abc"))}
+    shown = STORE.deserialize_cdr(found["/camera"], "sensor_msgs/msg/CompressedImage")
+    assert (shown.header.frame_id, shown.format) == ("camera", "jpeg")
+    assert bytes(shown.data) == b"abc"
+    (frame,) = STORE.deserialize_cdr(found["/tf"], VIEWS["/tf"]).transforms
+    assert (frame.header.frame_id, frame.child_frame_id) == ("base_link", "camera")

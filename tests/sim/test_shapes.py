@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cloudrc.config.schema import World
+from cloudrc.geometry.shapes import Shapes
 from cloudrc.robots.shapes import read_shapes
 from cloudrc.sim.engine import mujoco
 
@@ -77,3 +78,12 @@ def test_the_robot_is_in_the_frame_of_its_base(scene, robot):
     for one, other in zip(turned.robot, level.robot, strict=True):
         assert one.rgba == other.rgba
         np.testing.assert_allclose(one.corners, other.corners, atol=1e-9)
+
+
+def test_the_camera_of_a_robot_looks_along_z_of_its_frame():
+    """x of the frame is to the right, y down, as REP-103 says of optical frames."""
+    shapes = read_shapes(World(robot="x2", scene="empty"))
+    place, turn = Shapes.from_bytes(shapes.to_bytes()).camera
+    assert place == pytest.approx((0.1, 0.0, 0.0))
+    assert abs(np.dot(turn, (0.5, -0.5, 0.5, -0.5))) == pytest.approx(1.0)
+    assert read_shapes(World(robot="pelican", scene="empty")).camera is None

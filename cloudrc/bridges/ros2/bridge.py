@@ -23,7 +23,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.type_support import check_for_type_support
-from sensor_msgs.msg import LaserScan
+from sensor_msgs.msg import CompressedImage, LaserScan
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -47,9 +47,9 @@ from cloudrc.record.live import (
     encode_tree,
     frames_of,
 )
-from cloudrc.record.ros import pack_scan
+from cloudrc.record.ros import pack_picture, pack_scan
 from cloudrc.record.topics import TOPICS
-from cloudrc.records import Control, Record, ScanTaken, TelemetrySent
+from cloudrc.records import Control, FrameKept, Record, ScanTaken, TelemetrySent
 from cloudrc.report.markers import GOAL, encode_markers, path_shape
 
 KEPT = QoSProfile(
@@ -73,8 +73,8 @@ JUMP = 0.5
 
 def load_messages() -> None:
     """Load the code of all messages; raise an exception if it is not for this ROS or Python."""
-    own = (Odometry, LaserScan, PoseStamped, Twist, String, Trigger, MarkerArray, DiagnosticArray)
-    for kind in own:
+    own = Odometry, LaserScan, CompressedImage, PoseStamped, Twist, String, Trigger, MarkerArray
+    for kind in (*own, DiagnosticArray):
         check_for_type_support(kind)
 
 
@@ -87,6 +87,7 @@ class Shown(NamedTuple):
     covariances: Covariances = (EXACT, EXACT)  # of the measured pose and twist
     navigates: bool = True  # whether it serves Nav2's action
     scanner: Pose | None = None  # of the robot's scanner in the frame of its base; None: none
+    camera: Pose | None = None  # of its camera, likewise
 
 
 class RosBridge(OwnNode):
@@ -103,7 +104,8 @@ class RosBridge(OwnNode):
         """Open the node below `namespace`; `tell` gets words for the user."""
         super().__init__("cloudrc_bridge", namespace)
         self._robot = namespace.strip("/")
-        self._frames, self._markers, self._scanner = shown.frames, shown.scene, shown.scanner
+        self._frames, self._markers = shown.frames, shown.scene
+        self._scanner, self._camera = shown.scanner, shown.camera
         self._covariances = shown.covariances
         self._steering, self._requests = steering, requests
         self._health, self._news = FlightHealth(), MissionNews(steering.api, requests)
@@ -114,6 +116,8 @@ class RosBridge(OwnNode):
         publisher = self.node.create_publisher
         self._odometry = publisher(Odometry, "odom", QUEUED)
         self._scans = publisher(LaserScan, "scan", QUEUED) if shown.scanner else None
+        compressed = "camera/compressed"  # as image_transport names it
+        self._images = publisher(CompressedImage, compressed, QUEUED) if shown.camera else None
         self._guards = publisher(String, "cloudrc/guard", KEPT)
         self._scene = publisher(MarkerArray, "cloudrc/scene", KEPT)
         self._path = publisher(MarkerArray, "cloudrc/path", KEPT)
@@ -168,7 +172,7 @@ class RosBridge(OwnNode):
         from tf2_msgs.msg import TFMessage
 
         self._static = self.node.create_publisher(TFMessage, "/tf_static", KEPT)
-        tree = self._frames.at_rest(self._scanner)
+        tree = self._frames.at_rest(self._scanner, self._camera)
         self._static.publish(encode_tree(time.time_ns(), tree))  # a late node gets one message
         return self.node.create_publisher(TFMessage, "/tf", QUEUED)
 
@@ -180,6 +184,10 @@ class RosBridge(OwnNode):
             stamp_ns, *values = TOPICS["/scan"].row(record)
             stamp_ns += self._slip_ns + self._offset_ns
             self._scans.publish(pack_scan((stamp_ns, *values), self._frames.lidar))
+        elif isinstance(record, FrameKept) and self._images is not None:
+            stamp_ns, *values = TOPICS["/camera"].row(record)
+            stamp_ns += self._slip_ns + self._offset_ns
+            self._images.publish(pack_picture((stamp_ns, *values), self._frames.camera))
         elif isinstance(record, Control) and self._transforms is not None:
             stamp_ns = record.stamp_ns + self._offset_ns
             frames = frames_of(record, self._frames.prefix)

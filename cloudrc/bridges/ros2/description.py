@@ -13,7 +13,7 @@ from cloudrc.config.disturbances import SensorsConfig
 from cloudrc.geometry.shapes import Pose, Surface
 from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.record.live import BASE, WORLD, Covariance, covariance
-from cloudrc.record.ros import LIDAR
+from cloudrc.record.ros import CAMERA, LIDAR
 
 MAP, ODOM = "map", "odom"
 """Frames of REP-105."""
@@ -42,6 +42,11 @@ class RobotFrames(NamedTuple):
         return self.prefix + LIDAR
 
     @property
+    def camera(self) -> str:
+        """Frame of the robot's camera: x to the right, y down, z ahead."""
+        return self.prefix + CAMERA
+
+    @property
     def odom(self) -> str:
         """Frame in which the base moves."""
         return self.prefix + ODOM if self.rep_105 else WORLD
@@ -51,14 +56,17 @@ class RobotFrames(NamedTuple):
         """Frames in which a goal may be."""
         return (MAP, WORLD, self.odom) if self.rep_105 else (MAP, WORLD)
 
-    def at_rest(self, scanner: Pose | None) -> dict[str, dict[str, Pose]]:
+    def at_rest(
+        self, scanner: Pose | None, camera: Pose | None = None
+    ) -> dict[str, dict[str, Pose]]:
         """Return frame -> frames that do not move in it -> their poses in it.
 
-        `scanner` is the pose of the robot's scanner in the frame of its base; None: it has none.
+        `scanner` and `camera` are the poses of these in the frame of the base; None: it has none.
         """
         tree = {MAP: {self.odom: HERE}} if self.rep_105 else {WORLD: {MAP: HERE}}
-        if scanner is not None:
-            tree[self.base] = {self.lidar: scanner}
+        sensors = {self.lidar: scanner, self.camera: camera}
+        if mounted := {frame: pose for frame, pose in sensors.items() if pose is not None}:
+            tree[self.base] = mounted
         return tree
 
 
