@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.output import output_argument, print_result
 from cloudrc.cli.parser import Options, Parser
+from cloudrc.errors import BadInputError
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
@@ -39,7 +41,10 @@ def execute(options: Options) -> None:
     from cloudrc.runs.see import look_again, summarize
 
     with Progress(f"reads the recording of {options.run}"):
-        looks = look_again(options.run, options.perception)
+        try:
+            looks = look_again(options.run, options.perception)
+        except InvalidValueError as error:
+            raise BadInputError(str(error)) from None
     summary = summarize(looks)
     document = {"summary": summary, "looks": [_as_json(each) for each in looks]}
     print_result(options.output, document, "\n".join(_lines(looks, summary)))

@@ -25,15 +25,14 @@ from cloudrc.cloud.operator import (
     make_robot_status,
 )
 from cloudrc.cloud.perceiving import Perceiver
-from cloudrc.cloud.perceptions import Frame
 from cloudrc.cloud.receiving import FrameReceiver
+from cloudrc.cloud.sight import KINDS, Sight
 from cloudrc.errors import ControllerLostError
 from cloudrc.messages import (
     NEVER_NS,
     Datagram,
     GuardState,
     OperatorRequest,
-    RangeScan,
     Request,
     Setpoint,
     Telemetry,
@@ -48,7 +47,7 @@ from cloudrc.records import (
     SessionOpened,
 )
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import LATE, REPEATED, USED, ReceiveWindow
+from cloudrc.tunnel.channel import LATE, REPEATED, USED
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
 from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake
@@ -78,7 +77,6 @@ SILENT_PERIODS = 3
 """With answers on arrival, cloud sends a command after so many half periods without newer
 telemetry: the guard needs 10 in 500 ms to leave HOLD."""
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # often used
-SCAN, FRAME = int(Kind.SCAN), int(Kind.FRAME)
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
@@ -89,14 +87,10 @@ class CloudEndpoint(TunnelEnd):
         teleop: Source of setpoints and operator requests.
         telemetry: The newest telemetry; None before the first.
         watch: Is called with epoch, counter and content of each telemetry that cloud uses.
-        watch_scan: Is called likewise with each scan.
-        watch_frame: Is called with each picture.
+        sight: Receives what the robot sees.
     """
 
     telemetry: Telemetry | None = None
-    watch: Callable[[int, int, Telemetry], None] | None = None
-    watch_scan: Callable[[int, int, RangeScan], None] | None = None
-    watch_frame: Callable[[Frame], None] | None = None
 
     def __init__(
         self,
@@ -119,8 +113,8 @@ class CloudEndpoint(TunnelEnd):
             identity: Identity and keys of this end.
             newest_wins: Whether to drop telemetry that arrives after newer telemetry.
             compute: The simulated time between computation and departure of a command; None: 0.
-            perceiver: Makes setpoints of what the robot sees; None: that changes nothing.
-            frames: Receives the pictures of the robot's camera; None: there are none.
+            perceiver: As `Sight` takes it.
+            frames: As `Sight` takes it.
             start_ns: The present time on cloud's monotonic clock [ns].
             on_arrival: Whether newer telemetry, and not a period, makes a command due.
         """
@@ -129,9 +123,9 @@ class CloudEndpoint(TunnelEnd):
         self._handshake = ClientHandshake(identity.nonce, identity.clock_id)
         self._hellos = 0
         self._setpoint: Setpoint | None = None
-        self._perceiver, self._frames = perceiver, frames
-        self._scan_channel = ReceiveWindow(newest_wins=True)
+        self._perceiver, self.sight = perceiver, Sight(perceiver, frames, loop.counts)
         self._world = ""  # identifies the world process of the session
+        self.watch: Callable[[int, int, Telemetry], None] | None = None
         self._control: Control | None = None  # record of the session's last command
         self._uplink_delay = nan  # of the newest telemetry [s]
         self._alarm = EmergencyStopRepeater()
@@ -258,10 +252,8 @@ class CloudEndpoint(TunnelEnd):
             kind, epoch, counter, body = self._session.open(data)
             if kind == TELEMETRY:
                 self._receive_telemetry(epoch, counter, body, now_ns)
-            elif kind == SCAN:
-                self._receive_scan(epoch, counter, body, now_ns)
-            elif kind == FRAME:
-                self._receive_piece(body, now_ns)
+            elif kind in KINDS:
+                self._records += self.sight.receive(kind, epoch, counter, body, now_ns)
             elif kind == Kind.ACCEPT:
                 self._receive_accept(epoch, Accept(*codec.decode(Kind.ACCEPT, body)), now_ns)
             elif kind == Kind.CHALLENGE:
@@ -325,11 +317,7 @@ class CloudEndpoint(TunnelEnd):
         self._session.begin(epoch, nonces, self._session.greeting_key)
         self._told.clear()
         self._channel.reset()
-        self._scan_channel.reset()
-        if self._perceiver is not None:
-            self._perceiver.begin_session()
-        if self._frames is not None:
-            self._frames.begin_session(epoch)
+        self.sight.begin_session(epoch)
         self._loop.reset(now_ns)
         self._setpoint = None  # the robot may have moved; teleop sends a new one
         self._control, self._uplink_delay = None, nan
@@ -363,30 +351,6 @@ class CloudEndpoint(TunnelEnd):
             if self.watch is not None:
                 self.watch(epoch, counter, telemetry)
             self._use_telemetry(telemetry, epoch, delay, now_ns)
-
-    def _receive_scan(self, epoch: int, counter: int, body: Any, now_ns: int) -> None:
-        """Give a scan that is newer than all before to the perception."""
-        outcome = self._scan_channel.take(counter)
-        scan = codec.decode_scan(body) if type(body) is bytes else body
-        if outcome != USED:
-            self.counts[f"scan_{outcome}"] += 1
-            return
-        if self.watch_scan is not None:
-            self.watch_scan(epoch, counter, scan)
-        if self._perceiver is not None:
-            self._perceiver.receive_scan(scan, now_ns)
-
-    def _receive_piece(self, body: Any, now_ns: int) -> None:
-        """Give the pictures that a piece completes to the perception."""
-        piece = codec.decode_piece(body) if type(body) is bytes else body
-        if self._frames is None:
-            return
-        for frame in self._frames.receive(piece, now_ns):
-            if self.watch_frame is not None:
-                self.watch_frame(frame)
-            if self._perceiver is not None:
-                self._perceiver.receive_frame(frame, now_ns)
-        self._records += self._frames.take_records()
 
     def _use_telemetry(self, telemetry: Telemetry, epoch: int, delay: float, now_ns: int) -> None:
         """Give telemetry, newer than all before, to the loop and to teleop.

@@ -22,11 +22,12 @@ from cloudrc.config.overrides import build_plugin
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import facts, known_robot
 from cloudrc.config.scene import steered_in
-from cloudrc.errors import BadInputError, describe_error
+from cloudrc.errors import describe_error
 from cloudrc.geometry.rays import angles_of
 from cloudrc.messages import Odometry, Setpoint, Vector
 from cloudrc.metrics.flight import rows_of
 from cloudrc.outside.code import attempt
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.pictures import Jpeg
 from cloudrc.record.columns import Recording
 from cloudrc.report.flown import flight_of
@@ -53,6 +54,9 @@ def look_again(run: Path, name: str | None) -> list[SecondLook]:
     """Let a perception look at the pictures or scans of a run, its folder or its MCAP file.
 
     `name` is a perception's name or file; None: that of the flight.
+
+    Raises:
+        InvalidValueError: If the run has nothing to look at, or no perception.
     """
     if run.is_dir():
         check_ended(run)
@@ -69,7 +73,7 @@ def _build(experiment: ResolvedExperiment, name: str | None) -> Perception:
     if name is not None:
         choice = PlugIn(name=str(Path(name).resolve()) if plugins.is_path(name) else name)
     if choice is None:
-        raise BadInputError("the flight had no perception; name one with --perception")
+        raise InvalidValueError("the flight had no perception; name one with --perception")
     robot = facts(experiment.world, guard.acceleration_max_mps2, guard.speed_max_mps)
     perception: Perception = build_plugin("perceptions", choice, robot=robot)
     return perception
@@ -107,7 +111,7 @@ def _seen(recording: Recording, experiment: ResolvedExperiment, sensor: str) -> 
     kept = recording["/scan" if sensor == "scan" else "/camera"]
     if not len(kept):
         kind = "scans" if sensor == "scan" else "pictures; fly again with --set camera.keep=true"
-        raise BadInputError(f"the recording has no {kind}")
+        raise InvalidValueError(f"the recording has no {kind}")
     if robot.scan is not None and sensor == "scan":
         angles = angles_of(robot.scan.rays, robot.scan.fov_deg)
         for stamp_ns, ranges in rows_of(kept, "stamp_ns", "ranges"):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.sim.egl import NO_EGL
-from cloudrc.sim.engine import mujoco
+from cloudrc.sim.engine import mujoco, place_cameras
 from cloudrc.sim.scene import find_camera, is_of_robot
 
 if TYPE_CHECKING:
@@ -114,9 +114,7 @@ class Camera:
     def render(self) -> NDArray[np.uint8]:
         """Return what the camera saw at the last `aim`: red, green, blue, row 0 is the highest."""
         model, data = self._model, self._data
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_camlight(model, data)
+        place_cameras(model, data)
         drawn = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(model, data, self._options, None, self._view, drawn, self._scene)
         self._context.make_current()

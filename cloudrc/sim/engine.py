@@ -56,6 +56,13 @@ def at_rest(model: Any) -> Any:
     return data
 
 
+def place_cameras(model: Any, data: Any) -> None:
+    """Compute where bodies and cameras are at the positions of the joints in `data`."""
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_camlight(model, data)
+
+
 @contextmanager
 def compiling(what: object) -> Iterator[None]:
     """Turn an error of MuJoCo in the block, which compiles `what`, into an InvalidValueError.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.geometry.moving import Moving
 from cloudrc.records import TargetSeen
-from cloudrc.sim.engine import mujoco
+from cloudrc.sim.engine import at_rest, place_cameras
 from cloudrc.sim.scene import find_camera
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class MovingTarget:
         """
         self._moving, self._begin_ns = moving, 0
         self._place = data.mocap_pos[model.body(moving.name).mocapid[0]]
-        self._model, self._data = model, mujoco.MjData(model)
+        self._model, self._data = model, at_rest(model)
         self._flown, self._qpos = data.qpos, self._data.qpos
         number = find_camera(model, camera)
         self._eye = self._data.cam_xpos[number]
@@ -50,8 +50,7 @@ class MovingTarget:
         """Move the body, and return where it is at `now_ns` [ns], world's clock."""
         self.move(now_ns)
         self._qpos[:] = self._flown
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_camlight(self._model, self._data)
+        place_cameras(self._model, self._data)
         # A camera of MuJoCo looks along -z; x is to the right, y up.
         x, y, z = ((self._place - self._eye) @ self._axes).tolist()
         inside = -z > 0.0 and abs(x) <= -z * self._side and abs(y) <= -z * self._up
