@@ -223,6 +223,8 @@ _add(
      "the camera and the target, true positions."),
     *((f"budget_{_stage}", "s", f"Mean of a stage of seen_to_acted: {_words}.")
       for _stage, _words in SCAN_STAGES.items()),
+    frame_age_mean="age of pictures, mean",
+    out_of_view="share out of view",
 )  # fmt: skip
 for _way, _words in WAYS.items():
     _add(
