@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterable, Sequence
 from struct import Struct
 from typing import TYPE_CHECKING, Self
@@ -47,13 +48,13 @@ class Body(Model):
         for velocity, duration in commands:
             self.advance(velocity, duration)
 
-    def coast(self, velocity: Vector, dt: float, count: int) -> list[tuple[Vector, Vector]]:
+    def coast(self, velocity: Vector, dt: float, count: int) -> array[float]:
         """Advance by `dt` [s], `count` times, under one command `velocity` [m/s].
 
-        Return the position [m] and the velocity [m/s] after each step.
+        Return the position [m] and the velocity [m/s] after each step: six numbers of each.
         """
         states = (self.step(velocity, dt) for _ in range(count))
-        return [(state.position, state.velocity) for state in states]
+        return array("d", [n for each in states for n in (*each.position, *each.velocity)])
 
     def follow(
         self, law: Law, goals: Sequence[bytes], dt: float, velocity: Vector, most: float

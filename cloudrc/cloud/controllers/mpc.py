@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from itertools import chain
 from math import inf, sqrt
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,8 @@ SETTLED = 1.0
 """Time after which the lags of a robot that has a steady command are over [s]."""
 ROUNDING = 1e-9
 """Part of a limit by which a rounded value may exceed it [1]."""
+WHERE = attrgetter("position", "velocity")
+"""What counts of a setpoint."""
 
 
 class Mpc(Controller):
@@ -103,8 +106,9 @@ class Mpc(Controller):
         """Compute the velocities from now on; `dt` is the time since the last command [s]."""
         present = self._present(dt)
         begin = model.step(present, LOOK)
-        states = [(begin.position, begin.velocity), *_coast(model, present)]
-        positions, velocities = map(_rows, zip(*states, strict=True))
+        states = np.empty((AHEAD, 6))
+        states[0], states[1:] = (*begin.position, *begin.velocity), _coast(model, present)
+        positions, velocities = states[:, :3], states[:, 3:]
         wanted, speeds = self._approach(positions[0], goals)
         errors = np.concatenate((wanted - positions, speeds - velocities))
         changes = self._optimum(errors.T[:, :, None], np.array(present)[:, None])
@@ -132,9 +136,7 @@ class Mpc(Controller):
         speed, then with constant braking, at last exponentially: an optimum over 0.8 s does not
         know that the robot has to brake later.
         """
-        found = [goals(time) for time in TIMES]
-        at = _rows([each.position for each in found])
-        moving = _rows([each.velocity for each in found])
+        at, moving = _where([goals(time) for time in TIMES])
         away = position - at[0]
         left = distance = sqrt(float(away @ away))
         braking, rests, speeds = BRAKING * self._acceleration, [], []
@@ -148,7 +150,7 @@ class Mpc(Controller):
             rests.append(left)
             left -= speed * LOOK
         way = away / (distance or 1.0)
-        return at + np.outer(rests, way), moving - np.outer(speeds, way)
+        return at + np.array(rests)[:, None] * way, moving - np.array(speeds)[:, None] * way
 
     def _optimum(self, errors: Any, present: Any) -> Any:
         """Return the best changes of the command [m/s], shape (3, MOVES).
@@ -170,17 +172,19 @@ class Mpc(Controller):
         return changes
 
 
-def _rows(vectors: Iterable[Vector]) -> Any:
-    """Return AHEAD vectors, shape (AHEAD, 3); `np.array` of tuples takes three times as long."""
-    return np.fromiter(chain.from_iterable(vectors), float, 3 * AHEAD).reshape(AHEAD, 3)
+def _where(setpoints: Iterable[Setpoint]) -> tuple[Any, Any]:
+    """Return positions [m] and velocities [m/s] of AHEAD setpoints, both of shape (AHEAD, 3)."""
+    numbers = chain.from_iterable(chain.from_iterable(map(WHERE, setpoints)))
+    rows = np.fromiter(numbers, float, 6 * AHEAD).reshape(AHEAD, 6)
+    return rows[:, :3], rows[:, 3:]
 
 
-def _coast(model: Model, velocity: Vector) -> list[tuple[Vector, Vector]]:
-    """Return the further positions [m] and velocities [m/s] under one command [m/s]."""
+def _coast(model: Model, velocity: Vector) -> Any:
+    """Return the further positions [m] and velocities [m/s] under one command [m/s], in a row."""
     if isinstance(model, Body):
-        return model.coast(velocity, LOOK, AHEAD - 1)
+        return np.frombuffer(model.coast(velocity, LOOK, AHEAD - 1)).reshape(AHEAD - 1, 6)
     states = (model.step(velocity, LOOK) for _ in range(AHEAD - 1))
-    return [(state.position, state.velocity) for state in states]
+    return [(*state.position, *state.velocity) for state in states]
 
 
 def _responses(axes: Axes) -> Any:

@@ -176,7 +176,7 @@ class WhiteBox(Body):
         advance(_address(body), _address(rows), len(rows) // 4, None)
         self._unpack(body)
 
-    def coast(self, velocity: Vector, dt: float, count: int) -> list[tuple[Vector, Vector]]:
+    def coast(self, velocity: Vector, dt: float, count: int) -> array[float]:
         """Advance by `dt` [s], `count` times, under one command `velocity` [m/s]."""
         advance = self._native.advance
         if advance is None:
@@ -187,8 +187,7 @@ class WhiteBox(Body):
         self._unpack(body)
         for _ in range(count):  # a sum, as in Python
             self.horizon += dt
-        vectors = [*_VECTOR.iter_unpack(states)]
-        return [*zip(vectors[::2], vectors[1::2], strict=True)]
+        return states
 
     def follow(
         self, law: Law, goals: Sequence[bytes], dt: float, velocity: Vector, most: float
