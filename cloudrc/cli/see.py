@@ -24,7 +24,10 @@ examples:
   cloudrc see runs/latest -o json                 its own perception once more
 
 The recording of the experiment follow has its pictures; others have them with
---set camera.keep=true. Scans are always there."""
+--set camera.keep=true. Scans are always there. A time is that since the
+mission's start at which a picture or scan was taken. The odometry is the newest
+of that time; cloud may have had an older one, so that a perception which uses
+velocities can differ from its own flight by millimetres."""
 
 
 def arguments(parser: Parser) -> None:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict, deque
 from collections.abc import Iterator
 from functools import partial
 from itertools import starmap
@@ -82,7 +83,10 @@ def _build(experiment: ResolvedExperiment, name: str | None) -> Perception:
 def _look(
     recording: Recording, experiment: ResolvedExperiment, perception: Perception
 ) -> Iterator[SecondLook]:
-    """Let it look with the newest odometry of the time, whether or not that had arrived."""
+    """Let it look from the mission's start on, with the newest odometry of the time.
+
+    Cloud may have had an older one, and a perception that was busy saw less.
+    """
     flight, odometry = flight_of(recording, experiment), recording["/odometry"]
     fence, steered = steered_in(experiment.world), recording["/perception"]
     flown = dict(rows_of(steered, "seen_stamp_ns", "position"))
@@ -95,13 +99,13 @@ def _look(
     perception.reset()
     for seen in _seen(recording, experiment, perception.takes):
         row = int(np.searchsorted(odometry["stamp_ns"], seen.stamp_ns, side="right")) - 1
-        if row < 0:
+        now = float(flight.seconds(seen.stamp_ns))
+        if row < 0 or now < 0.0:
             continue
         setpoint, error = attempt(partial(see, seen, measured[row]))
         place = flown.get(seen.stamp_ns)
         why = "" if error is None else describe_error(error)
         known = place is not None and isfinite(place[0])
-        now = float(flight.seconds(seen.stamp_ns))
         yield SecondLook(now, setpoint, place if known else None, why)
 
 
@@ -118,12 +122,15 @@ def _seen(recording: Recording, experiment: ResolvedExperiment, sensor: str) -> 
             yield Scan(stamp_ns, np.array(ranges), angles)
     elif robot.camera is not None:
         fovy, files = radians(robot.camera.fovy_deg), Jpeg()  # it reads PNG, too
-        shown = rows_of(recording["/frame_shown"], "stamp_ns", "taken_ns", "number")
-        taken = {stamp_ns: (taken_ns, number) for stamp_ns, taken_ns, number in shown}
+        taken = defaultdict[int, deque[tuple[int, int]]](deque)  # several may come at one time
+        for stamp_ns, *which in rows_of(
+            recording["/frame_shown"], "stamp_ns", "taken_ns", "number"
+        ):
+            taken[stamp_ns].append((which[0], which[1]))
         for stamp_ns, data in rows_of(kept, "stamp_ns", "data"):
-            if (image := files.decode(data)) is not None and stamp_ns in taken:
-                taken_ns, number = taken[stamp_ns]
-                yield Frame(taken_ns, number, image, fovy)
+            image = files.decode(data)
+            if taken[stamp_ns] and image is not None:
+                yield Frame(*taken[stamp_ns].popleft(), image, fovy)
 
 
 def summarize(looks: list[SecondLook]) -> dict[str, float | int | None]:
