@@ -206,6 +206,7 @@ _add(
      "perception, command and downlink."),
     ("seen_to_acted_p99", "s", "99th percentile of the time from a scan or picture until the robot "
      "acts on it."),
+    ("seen_to_acted_max", "s", "Longest time from a scan or picture until the robot acts on it."),
     ("seen_dropped", "1", "Number of scans or pictures in whose place the perception took newer "
      "ones."),
     ("frame_age_mean", "s", "Age of the newest picture that cloud has, mean over time."),
@@ -223,7 +224,7 @@ _add(
      "the camera and the target, true positions."),
     *((f"budget_{_stage}", "s", f"Mean of a stage of seen_to_acted: {_words}.")
       for _stage, _words in SCAN_STAGES.items()),
-    frame_age_mean="age of pictures, mean",
+    seen_to_acted="seen to acted, mean",
     out_of_view="share out of view",
 )  # fmt: skip
 for _way, _words in WAYS.items():

@@ -48,5 +48,6 @@ def _dropped(flight: Flight) -> float | None:
 add_measures(
     ("seen_to_acted", _seen_to_acted, "mean"),
     ("seen_to_acted_p99", _seen_to_acted, "p99"),
+    ("seen_to_acted_max", _seen_to_acted, "max"),
     ("seen_dropped", _dropped),
 )

@@ -46,6 +46,8 @@ def _goal(report: Mapping[str, Any]) -> str:
     """Return what the robot has done in a mission that succeeded."""
     if (end := report["numbers"].get("final_error")) is not None:
         return f"setpoints flown to their end, {end['value']:.2f} m from the last one"
+    if (out := report["numbers"].get("out_of_view")) is not None:
+        return f"flown to the end, the target out of view for {out['value']:.1%} of the time"
     return "every step flown" if "steps" in report else "every waypoint reached"
 
 

@@ -13,7 +13,7 @@ from cloudrc.text import table
 
 ROUND_TRIPS = {"rtt": "round trip without the time in world", "loop_delay": "with it"}
 """What cloud alone knows -> in words."""
-SCAN_AGE = "age of a scan when the robot acts on it"
+SCAN_AGE = "age of a scan or picture when acted on"
 
 
 def as_text(budget: Mapping[str, Any]) -> str:
@@ -47,7 +47,7 @@ def _lines(budget: Mapping[str, Any]) -> Iterator[str]:
     if scans := budget.get("scans"):
         rows = [(each["text"], each) for each in scans["stages"].values()]
         yield from ("", *_table([*rows, (SCAN_AGE, scans["age"])]))
-        yield f"  of {scans['commands']} scans on which the robot acted"
+        yield f"  of {scans['commands']} scans or pictures on which the robot acted"
 
 
 def fleet_text(found: Mapping[str, Any]) -> str:

@@ -330,7 +330,13 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
     assert (notes, list(numbers)) == ([], sorted(numbers))
     resting = {f"steady_error_{axis}" for axis in "xyz"}
     others = {"recorder_dropped", "final_error", "controller_gaps", "yaw_error", "age_violation"}
-    others |= {"commands_withheld", "seen_dropped", "seen_to_acted", "seen_to_acted_p99"}
+    others |= {
+        "commands_withheld",
+        "seen_dropped",
+        "seen_to_acted",
+        "seen_to_acted_p99",
+        "seen_to_acted_max",
+    }
     others |= {"frames_shown", "frame_psnr", "video_kbit", "frames_late"}
     others |= {f"frame_age_{name}" for name in ("mean", "p99", "max")}
     others |= {"out_of_view", "bearing_error_rms"}
