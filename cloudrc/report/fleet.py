@@ -125,7 +125,10 @@ class FleetFlown:
 
 def fleet_document(flown: FleetFlown) -> dict[str, Any]:
     """Return the content of the fleet's report.json."""
-    experiment, alone = flown.experiment, not flown.experiment.cell.traffic
+    experiment = flown.experiment
+    # Pictures and scans are no packets of the theory's one size and period, either.
+    senses = experiment.camera is not None or experiment.scans
+    alone = not experiment.cell.traffic and not senses
     return {
         **judge_robots(flown.robots),
         "experiment": experiment.name,
@@ -178,7 +181,7 @@ def cell_rows(log: Iterable[Usage], senders: int, *, alone: bool) -> list[dict[s
 def cell_numbers(done: Sequence[Usage], senders: int, *, alone: bool) -> dict[str, Any]:
     """Return the numbers of the cell of a direction; a wait without end is None.
 
-    `senders` is the number of robots, which are `alone` if there is no other traffic.
+    `senders` is the number of robots, which are `alone` if telemetry is all that is sent.
     """
     way, duration = done[-1].direction, done[-1].time_s
     names = "packets", "busy_ns", "waited_ns"

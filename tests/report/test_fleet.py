@@ -5,7 +5,9 @@
 import numpy as np
 import pytest
 
-from cloudrc.report.fleet import separation_min, tables
+from cloudrc.config.load import load_experiment
+from cloudrc.link.cell import Usage
+from cloudrc.report.fleet import FleetFlown, fleet_document, separation_min, tables
 
 NUMBERS = {"age_ms": 100.0, "hold_s": 0.5}
 SPAWN = (0.0, 0.0, 0.1)
@@ -35,3 +37,16 @@ def test_a_wait_without_end_is_a_dash_and_a_column_without_any_number_is_left_ou
     cells = [cell, cell | {"md1_ms": 3}]
     _, rows = tables({"robots": [], "median": {}, "worst": {}, "cell": cells})
     assert [row[4] for row in rows] == ["M/D/1 [ms]", "-", "3.00"]
+
+
+@pytest.mark.parametrize(
+    ("experiment", "is_known"), [("steps", True), ("follow", False), ("gap", False)]
+)
+def test_the_wait_of_periodic_senders_is_told_of_robots_that_send_telemetry_alone(
+    experiment, is_known
+):
+    used = Usage("uplink", time_s=1.0, packets=100, size=23_200, busy_ns=185_600_000)
+    flown = FleetFlown(load_experiment(experiment, ["cell.rate_kbit=1000"]), log=[used])
+    flown.robots = [{"robot": 0, "verdict": "success"}]
+    (cell,) = fleet_document(flown)["cell"]
+    assert ("nddd1_ms" in cell) is is_known
