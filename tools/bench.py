@@ -2,7 +2,7 @@
 
 """`make bench`: how much processor time does a flight cost, and has a change made it cheaper?
 
-    make bench                      # flights of all kinds beside `steps`, and steps of `Networked`
+    make bench                      # flights beside `steps`, steps of `Networked`, and `follow`
     make bench AGAINST=COMMIT       # the loop and a sweep's flight, beside those of another commit
     make bench AGAINST=COMMIT FLIGHTS=20 ROWS=fast      # the rows that have this word in their name
 
@@ -23,6 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from ctypes.util import find_library
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -62,6 +63,9 @@ KINDS = {
 ENVIRONMENTS = "CartPole-v1", "Pendulum-v1"
 STEP_MAX = 20.0
 """Largest processor time of a step of `Networked`, without the environment's [us]."""
+FOLLOW = "run", "follow", "--mode", "virtual"
+FOLLOW_MAX = 20.0
+"""Largest processor time of this command, 40 s with 15 pictures a second and its report [s]."""
 ROBOTS, ROBOT_STEPS, CHANNEL_MAX = 20, 2_000, 1.3
 """Robots that share a channel; their steps; largest cost of one's step in steps of `Networked`."""
 
@@ -247,6 +251,25 @@ def shared(repeats: int = 5) -> list[tuple[str, ...]]:
     ]
 
 
+def camera(repeats: int = 3) -> list[tuple[str, ...]]:
+    """Measure a flight with a camera, as its user types it."""
+    if find_library("EGL") is None:
+        return [("with a camera: not measured, needs libegl1 and libgl1-mesa-dri",)]
+    spent = list[float]()
+    for _ in range(repeats):
+        before = sum(os.times()[2:4])
+        with tempfile.TemporaryDirectory() as made:
+            words = [sys.executable, "-m", "cloudrc", *FOLLOW, "--out", f"{made}/run"]
+            subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+        spent.append(sum(os.times()[2:4]) - before)
+    missed = "MISSED" if min(spent) > FOLLOW_MAX else ""
+    name = f"cloudrc {' '.join(FOLLOW)}"
+    return [
+        ("with a camera", "processor time [s]", "asked", ""),
+        (name, f"{min(spent):.1f}", f"<= {FOLLOW_MAX:g}", missed),
+    ]
+
+
 def main() -> int:
     """Measure, print the results and return the exit code."""
     parser = argparse.ArgumentParser(prog="make bench", description=__doc__)
@@ -265,7 +288,7 @@ def main() -> int:
     else:
         names = [name for name in names if name != STEPS]
         tables = [beside_steps(names, options.flights)]
-        tables += [] if options.rows else [networked(), shared()]
+        tables += [] if options.rows else [networked(), shared(), camera()]
     for rows in tables:
         print(table(rows, right=range(1, 5)), end="\n\n", flush=True)
     return int(any("MISSED" in row for rows in tables for row in rows))
