@@ -120,6 +120,17 @@ SHOWN = (
         },
     ),
     Shown(
+        "docs/which-number.md",
+        "cloudrc run follow --mode virtual --set link.both.delay_ms=70",
+        15.0,
+        numbers={
+            "frame_age_mean": "103 ms",
+            "frame_age_p99": "136 ms",
+            "seen_to_acted": "143 ms",
+            "age_at_actuator_mean": "145 ms",
+        },
+    ),
+    Shown(
         "docs/timeline.md",
         "cloudrc run paper --mode virtual --set link.profile=lte --set cloud.compute_ms=7 &&"
         " cloudrc timeline runs/latest",
