@@ -280,9 +280,10 @@ bench: $(VENV)/dev ## measure flights of all kinds beside steps; AGAINST=COMMIT:
 bench-cell: $(VENV)/all ## measure how punctual the cell of 50 robots is
 	$(bin)/python -m tools.bench_cell $(BENCH_CELL)
 
-results: $(VENV)/dev ## fly the results of docs/results.md and docs/link.md, and write them there: minutes
+results: $(VENV)/dev ## fly the results of docs/results.md and docs/link.md, and write them there; needs EGL: an hour
 	$(bin)/python -m tools.results
 	$(bin)/python -m tools.radio
+	$(bin)/python -m tools.eyes
 
 shown: $(VENV)/dev ## compare the numbers on pages with what their commands give: 15 minutes
 	$(bin)/python -m tools.shown

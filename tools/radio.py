@@ -24,7 +24,6 @@ from cloudrc.statistics import median_interval
 from tools.markdown import table
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-BEGIN, END = "<!-- made by `python -m tools.radio` -->\n", "<!-- end of tools.radio -->\n"
 DELAY_MS, PPM, RATE = 3.0, 50.0, 100
 ERROR, AGE = "prediction_error_rms", "age_at_actuator_mean"
 WAYS = {
@@ -118,11 +117,12 @@ def remedies(rows: Sequence[dict[str, Any]]) -> str:
     return table(" | ".join(columns), cells())
 
 
-def write(page: Path, made: str) -> None:
-    """Put a table into its place on a page."""
-    before, _, rest = page.read_text("utf-8").partition(BEGIN)
-    _, _, after = rest.partition(END)
-    page.write_text(before + BEGIN + made + END + after, "utf-8")
+def write(page: Path, made: str, tool: str = "tools.radio") -> None:
+    """Put a table into its place on a page, between the marks of the `tool` that made it."""
+    begin, end = f"<!-- made by `python -m {tool}` -->\n", f"<!-- end of {tool} -->\n"
+    before, _, rest = page.read_text("utf-8").partition(begin)
+    _, _, after = rest.partition(end)
+    page.write_text(before + begin + made + end + after, "utf-8")
 
 
 def main() -> None:
