@@ -12,7 +12,7 @@ REGISTRY ?=
 BASE ?=
 CLUSTER ?= cloudrc
 # For ROS 2 in the cluster also cloud-ros: IMAGES=cloud-ros, and ROS=kilted for another distribution.
-IMAGES := world cloud
+IMAGES := world world-camera cloud
 ROS :=
 # The second tag of the images, by which a rebuilt image restarts pods: VERSION-gCOMMIT, and -dirty with a
 # hash of the files of the images that differ from it.
@@ -50,7 +50,7 @@ COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python
 	--generate-hashes --no-emit-index-url --custom-compile-command 'make lock'
 ROS_PACKAGES := rclpy rmw-fastrtps-cpp nav-msgs geometry-msgs sensor-msgs rosgraph-msgs std-msgs std-srvs \
 	diagnostic-msgs visualization-msgs
-# MuJoCo's viewers, a tenth of the image: a pod draws nothing.
+# MuJoCo's viewers, a tenth of the image: a pod draws nothing, but with world-camera.
 DRAWING := glfw pyopengl mujoco-studio
 
 # Some environments set this variable: then each of the tests' processes compiles all modules again.
@@ -257,7 +257,7 @@ AUDIT := $(bin)/pip-audit --require-hashes --disable-pip --progress-spinner off
 audit: $(VENV)/dev ## look up the images' packages in the advisories; write an SBOM of each to build/sbom
 	$(bin)/python -m pip install --quiet 'pip-audit>=2.9'
 	mkdir -p build/sbom
-	for role in world cloud cloud-ros; do \
+	for role in world world-camera cloud cloud-ros; do \
 		$(AUDIT) --requirement images/$$role/requirements.txt \
 			--format cyclonedx-json --output build/sbom/$$role.json || exit 1; \
 	done
@@ -290,7 +290,7 @@ shown: $(VENV)/dev ## compare the numbers on pages with what their commands give
 
 pictures: $(VENV)/dev ## draw the README's film and the pictures of robots and missions; needs EGL (libegl1): minutes
 	@$(bin)/python -c "import tools.pictures.stage" || { \
-		echo "make pictures needs EGL: apt-get install libegl1 libgl1-mesa-dri" >&2; exit 3; }
+		echo "make pictures needs EGL: apt-get install libegl1 libgl1-mesa-dri libopengl0" >&2; exit 3; }
 	$(bin)/python -m tools.pictures
 
 hashes: $(VENV)/dev ## fly the commands of tests/flights/hashes.json, and write their hashes: minutes
@@ -326,7 +326,7 @@ images: ## build the container images; needs Docker
 	@command -v docker >/dev/null || { \
 		echo "make images needs Docker: https://docs.docker.com/engine/install" >&2; exit 3; }
 	for role in $(IMAGES); do \
-		DOCKER_BUILDKIT=1 docker build --quiet --file images/$$role/Dockerfile \
+		DOCKER_BUILDKIT=1 docker build --quiet --file images/$${role%-camera}/Dockerfile --build-arg ROLE=$$role \
 			--tag $(REGISTRY)cloudrc/$$role:$(VERSION) --tag $(REGISTRY)cloudrc/$$role:$(BUILT) \
 			$(BUILD_ARGS) . || exit 1; \
 	done
@@ -350,8 +350,10 @@ lock: $(VENV)/bin/python ## update the locked requirements of images and tests
 	$(COMPILE) pyproject.toml --extra world --extra record --extra console --extra mpc --extra bucket \
 		--output-file images/world/requirements.txt \
 		$(DRAWING:%=--no-emit-package %)
-	$(COMPILE) pyproject.toml --extra record --extra api --extra mpc --output-file images/cloud/requirements.txt
-	$(COMPILE) pyproject.toml --extra world --extra record --extra api --extra policy --extra mpc \
+	echo pyopengl | $(COMPILE) - --output-file images/world-camera/requirements.txt
+	echo pillow | $(COMPILE) pyproject.toml - --extra record --extra api --extra mpc \
+		--output-file images/cloud/requirements.txt
+	echo pillow | $(COMPILE) pyproject.toml - --extra world --extra record --extra api --extra policy --extra mpc \
 		--output-file images/cloud-ros/requirements.txt $(DRAWING:%=--no-emit-package %)
 	printf 'hatchling\ntccbox\n' | $(COMPILE) - --output-file images/build-requirements.txt
 	$(COMPILE) pyproject.toml --extra dev --extra deep --no-emit-package cloudrc \

@@ -243,7 +243,7 @@ def save(folder):
 
 
 CLUSTER = "cloudrc-e2e"
-IMAGES = "world cloud prometheus"  # a real Prometheus is for these tests alone
+IMAGES = "world world-camera cloud prometheus"  # a real Prometheus is for these tests alone
 BUILD = ROOT / "build" / "e2e"
 TOOLS = ("docker", "kind", "helm", "kubectl")
 MISSING_PREREQUISITE = 3

@@ -16,13 +16,14 @@ from cloudrc import __version__
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ROLES = {"world": ("world", "record", "mpc"), "cloud": ("record", "api", "mpc")}
+BUILD = ROOT / "images" / "build-requirements.txt"
+DRAWS = ROOT / "images" / "world-camera" / "requirements.txt"
 LOCKS = {
     ROOT / "images" / "world" / "requirements.txt": ROLES["world"],
     ROOT / "images" / "cloud" / "requirements.txt": ROLES["cloud"],
     ROOT / "images" / "cloud-ros" / "requirements.txt": ("world", "record", "api", "policy", "mpc"),
     ROOT / "tests" / "requirements.txt": ("dev", "deep"),
 }
-BUILD = ROOT / "images" / "build-requirements.txt"
 
 
 def locked(path):
@@ -49,7 +50,7 @@ def test_a_lock_satisfies_pyproject(lock):
         assert requirement.specifier.contains(versions[name], prereleases=True), name
 
 
-@pytest.mark.parametrize("lock", [*LOCKS, BUILD])
+@pytest.mark.parametrize("lock", [*LOCKS, BUILD, DRAWS])
 def test_every_package_has_a_hash_and_no_address(lock):
     text = lock.read_text()
     blocks = re.split(r"^(?=[a-z0-9-]+(?:\[.*\])?==)", text, flags=re.MULTILINE)[1:]
@@ -62,7 +63,7 @@ def test_every_package_has_a_hash_and_no_address(lock):
 def test_a_base_image_is_a_stage_or_has_a_digest(role):
     text = (ROOT / "images" / role / "Dockerfile").read_text()
     stages = re.findall(r"^FROM \S+ AS (\S+)$", text, re.MULTILINE)
-    bases = re.findall(r"^FROM (\S+)", text, re.MULTILINE)
+    bases = re.findall(r"^FROM (\S+)", text.replace("${ROLE}", role), re.MULTILINE)
     pinned = [base for base in bases if re.fullmatch(r"\S+@sha256:[0-9a-f]{64}", base)]
     assert pinned
     assert {*bases} - {*pinned} <= {"${BASE}", *stages}
@@ -92,7 +93,7 @@ def test_a_rebuilt_image_has_a_tag_of_its_own_and_is_loaded_under_both(tmp_path,
         (tmp_path / "log").write_text("")
         said, log = run("make", *(targets or ("images", "kind-load"))), tmp_path / "log"
         (tag,) = re.findall(r"image\.tag=(\S+)", said)
-        for role in ("world", "cloud"):
+        for role in ("world", "world-camera", "cloud"):
             for each in (tag, __version__):
                 assert log.read_text().count(f"cloudrc/{role}:{each}")
         assert (tmp_path / "build" / "loaded" / "kind-cloudrc").read_text().strip() == tag
