@@ -60,6 +60,8 @@ def arguments(parser: Parser) -> None:
     pod = parser.add_argument_group("in the container of the chart")
     pod.add_argument("--config", type=Path, metavar="FILE", help="experiment file")
     pod.add_argument("--profile", type=Path, metavar="FILE", help="file of the link profile")
+    about = "folder of 'cloudrc cloud --records DIR', for the pictures of a camera"
+    pod.add_argument("--records", type=Path, metavar="DIR", help=about)
     api_arguments(pod, "the API of teleop")
 
 
@@ -129,7 +131,7 @@ def _in_pod(options: Options) -> ConsoleTarget:
 
     token = given_token(options)
     flight = flight_of_pod(options.config, options.profile, options.api, token, print_line)
-    return flight._replace(robot=options.robot)
+    return flight._replace(robot=options.robot, records=options.records)
 
 
 def _show_release(options: Options) -> int:

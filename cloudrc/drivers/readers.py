@@ -108,7 +108,8 @@ class RecordReader:
         Of the records, those of `kinds` alone are read; (): all.
         """
         self._heads = tuple(f'["{kind.__name__}"' for kind in kinds)
-        self._path = folder / f"r{os.getpid()}.sock"
+        # In a pod, the processes of two containers have the number 1.
+        self._path = folder / f"r{os.getpid()}-{len(kinds)}.sock"
         self._cloud = str(folder / CLOUD)
         self._socket = bind_datagrams(self._path)
         self._connect()

@@ -8,6 +8,7 @@ Shadows and multisampling are off: they take most of the time where no GPU rende
 
 from __future__ import annotations
 
+import ctypes
 import os
 import weakref
 from collections.abc import Callable
@@ -47,7 +48,7 @@ def _open_egl() -> tuple[Any, Callable[[], None], str]:
         context = GLContext(0, 0)
         context.make_current()
         return context, EGL.eglReleaseThread, GL.glGetString(GL.GL_RENDERER).decode()
-    except (ImportError, AttributeError, RuntimeError, OSError) as error:
+    except (ImportError, AttributeError, RuntimeError, OSError, ctypes.ArgumentError) as error:
         raise MissingPrerequisiteError(NO_EGL.format(" ".join(str(error).split()))) from None
 
 

@@ -9,7 +9,7 @@ import ctypes
 from cloudrc.errors import MissingPrerequisiteError
 
 LIBRARY = "libEGL.so.1"
-NO_EGL = "this machine cannot render ({}); run: apt-get install libegl1 libgl1-mesa-dri"
+NO_EGL = "this machine cannot render ({}); run: apt-get install libegl1 libgl1-mesa-dri libopengl0"
 
 
 def load_egl() -> None:

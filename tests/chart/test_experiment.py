@@ -9,7 +9,7 @@ from cloudrc.config.load import load_experiment, load_link
 from cloudrc.config.profile import load_profile
 from cloudrc.config.resolved import dump
 from cloudrc.config.shipped import names
-from tests.chart.conftest import of_kind, render
+from tests.chart.conftest import of_kind, pod_specs, render
 
 MEASURED = {"drive.csv": "time_s,delay_ms\n0,30\n1,40\n2,35\n"}
 TABLE = {"delay_ms": 35, "jitter_ms": 4, "distribution": "table", "table": "drive.csv"}
@@ -75,6 +75,20 @@ def test_a_named_file_is_in_each_configmap_that_names_it(key, way, tmp_path, exp
     for over in ({}, {"profile": "wifi"}):
         values = {**of_experiment, "link": {"traces": MEASURED, **over}}
         assert getattr(experiment(values).uplink, key) == file
+
+
+def test_h264_needs_images_of_ones_own():
+    values = {"experiment": {"camera": {"codec": "h264"}}}
+    with pytest.raises(Exception, match="h264 needs PyAV"):
+        render(values)
+    own = {"worldCamera": {"repository": "lab/world"}, "cloud": {"repository": "lab/cloud"}}
+    pods = pod_specs(render({**values, "image": own}))
+    assert [
+        pods[end]["containers"][0]["image"].partition(":")[0] for end in ("world", "cloud")
+    ] == [
+        "lab/world",
+        "lab/cloud",
+    ]
 
 
 def test_a_change_restarts_only_what_it_must():

@@ -87,7 +87,7 @@ def session_with_console(tmp_path_factory, *flags):
 def in_pod(file, robot=None, token_file=None):
     """Return what the console of a pod shows, whose experiment and profile are a file."""
     about = {"config": file, "profile": file, "api": "http://127.0.0.1:1"}
-    return console._in_pod(Namespace(**about, robot=robot, token_file=token_file))
+    return console._in_pod(Namespace(**about, robot=robot, token_file=token_file, records=None))
 
 
 def acknowledge(api):

@@ -7,5 +7,6 @@ from ctypes.util import find_library
 import pytest
 
 needs_renderer = pytest.mark.skipif(
-    find_library("EGL") is None, reason="no libEGL: apt-get install libegl1 libgl1-mesa-dri"
+    find_library("EGL") is None,
+    reason="no libEGL: apt-get install libegl1 libgl1-mesa-dri libopengl0",
 )

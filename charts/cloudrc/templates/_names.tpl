@@ -54,13 +54,16 @@ app.kubernetes.io/part-of: cloudrc
 {{- include "cloudrc.moreLabels" . }}
 {{- end }}
 
-{{/* Image of a role, "world", "cloud" or "ros", by digest if set, else by tag. That of cloud may be that
-     of ros. A registry for all charts comes first. */}}
+{{/* Image of a role, "world", "cloud" or "ros", by digest if set, else by tag. That of world is another
+     one if it draws; that of cloud may be that of ros. A registry for all charts comes first. */}}
 {{- define "cloudrc.image" -}}
 {{- $image := .root.Values.image -}}
 {{- $registry := (.root.Values.global | default dict).imageRegistry | default $image.registry -}}
 {{- $ros := .root.Values.cloud.ros -}}
 {{- $of := or (eq .role "ros") (and (eq .role "cloud") $ros.enabled) | ternary $ros.image (get $image .role) -}}
+{{- if and (eq .role "world") (include "cloudrc.hasCamera" .root) -}}
+{{- $of = $image.worldCamera -}}
+{{- end -}}
 {{- $name := $registry | empty | ternary $of.repository (printf "%s/%s" (trimSuffix "/" ($registry | default "")) $of.repository) -}}
 {{- if $of.digest -}}
 {{ $name }}@{{ $of.digest }}

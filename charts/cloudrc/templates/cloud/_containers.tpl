@@ -15,7 +15,7 @@
     - --config=/etc/cloudrc/experiment.yaml
     {{- include "cloudrc.endArgs" (dict "root" . "component" "cloud") | nindent 4 }}
     - --teleop=/run/cloudrc-teleop
-    {{- if .Values.ros.enabled }}
+    {{- if include "cloudrc.hasReaders" . }}
     - --records=/run/cloudrc-records
     {{- end }}
     - --key=/etc/cloudrc-secret/key
@@ -37,7 +37,7 @@
   volumeMounts:
     {{- include "cloudrc.endMounts" . | replace "name: data" (ternary "name: data-cloud" "name: data" (and $onboard (not (include "cloudrc.recordingsClaim" .)))) | nindent 4 }}
     - {name: teleop, mountPath: /run/cloudrc-teleop}
-    {{- if .Values.ros.enabled }}
+    {{- if include "cloudrc.hasReaders" . }}
     - {name: records, mountPath: /run/cloudrc-records}
     {{- end }}
     {{- include "cloudrc.extraMounts" .Values.cloud | nindent 4 }}
@@ -149,6 +149,9 @@
     - --token-file=/etc/cloudrc-tokens/operator
     - --profile=/etc/cloudrc-link/profile.yaml
     - --port=8090
+    {{- if include "cloudrc.hasCamera" . }}
+    - --records=/run/cloudrc-records
+    {{- end }}
     {{- with include "cloudrc.consoleOrigins" . }}
     {{- . | trimPrefix "\n" | nindent 4 }}
     {{- end }}
@@ -181,6 +184,9 @@
     - {name: tokens, mountPath: /etc/cloudrc-tokens, readOnly: true}
     - {name: link, mountPath: /etc/cloudrc-link, readOnly: true}
     - {name: scratch, mountPath: /tmp}
+    {{- if include "cloudrc.hasCamera" . }}
+    - {name: records, mountPath: /run/cloudrc-records}
+    {{- end }}
     {{- include "cloudrc.extraMounts" .Values.console | nindent 4 }}
 {{- end }}
 {{- with .Values.cloud.backgroundLoad }}
@@ -210,6 +216,11 @@
 {{- end }}
 {{- end }}
 
+{{/* Whether another container reads cloud's records: the bridge, or a console with the camera's pictures. */}}
+{{- define "cloudrc.hasReaders" -}}
+{{- if or .Values.ros.enabled (and .Values.console.enabled (include "cloudrc.hasCamera" .)) }}true{{ end -}}
+{{- end }}
+
 {{/* Volumes of these containers alone. */}}
 {{- define "cloudrc.cloudVolumes" -}}
 {{- with .Values.cloud.extraVolumes -}}
@@ -231,6 +242,8 @@
 - name: tmp-bridge
   emptyDir:
     sizeLimit: 64Mi
+{{- end }}
+{{- if include "cloudrc.hasReaders" . }}
 - name: records
   emptyDir:
     medium: Memory

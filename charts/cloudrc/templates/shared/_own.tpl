@@ -32,6 +32,11 @@
 {{ kindIs "map" $controller | ternary (get (kindIs "map" $controller | ternary $controller dict) "name") $controller }}
 {{- end }}
 
+{{/* Whether the robot's camera works: "true" or "". */}}
+{{- define "cloudrc.hasCamera" -}}
+{{- if not (kindIs "invalid" .Values.experiment.camera) }}true{{ end -}}
+{{- end }}
+
 {{/* The values' `experiment` with the user's robot and scene, and with the controller of cloud.ros, in
      the format of `cloudrc run`. That of a fleet lacks the number of robots, which may change without
      restarts, and has the link of link.profile, because a cell follows no other file. */}}
