@@ -284,8 +284,9 @@ def chart_values(
 
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> bool:
     """Fly the experiment's mission by a Job; return False if it was interrupted."""
-    flown = {"start", "touch", "waypoints", "carrot"}
-    mission = experiment.mission.model_dump(mode="json", include=flown)
+    from cloudrc.teleop.models import ORDERED
+
+    mission = experiment.mission.model_dump(mode="json", include=set(ORDERED))
     limit = experiment.criteria.time_limit_s
     job = run_job(release, {"name": experiment.name, "time_limit_s": limit, **mission})
     tell(f"Job {job} flies {experiment.name}")

@@ -48,6 +48,9 @@ LEASE_MIN, LEASE_MAX = 5, 3600
 """Limits of a mission's lease [s]. A shorter lease would end a mission whose watcher waits for
 a busy processor; with a longer one, a robot would fly for hours without a watcher."""
 
+ORDERED = ("start", "waypoints", "follow", "carrot", "judged_by", "touch")
+"""Keys of an experiment's mission that an order has, too."""
+
 Text = Annotated[str, Field(max_length=200)]
 
 
@@ -332,8 +335,7 @@ class RequestReader:
         request = _parse(body, MissionRequest)
         if not (request.waypoints or request.follow):  # only an experiment may have steps instead
             raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
-        kept = ("start", "waypoints", "follow", "carrot", "judged_by", "touch")
-        mission = MissionConfig(**{name: getattr(request, name) for name in kept})
+        mission = MissionConfig(**{name: getattr(request, name) for name in ORDERED})
         mission = put_on_ground(mission, self.world)
         if problems := check_mission(mission, self.world):
             raise RefusedError(problems)
