@@ -166,7 +166,10 @@ def _enter_namespace() -> None:
 
 
 def draw() -> None:
-    """Tell how long this machine needs for a picture of x2 in the scene with pipes."""
+    """Tell how long this machine needs for a picture of x2 in the scene with pipes.
+
+    If it cannot render, tell why, and end this process.
+    """
     from cloudrc.config.robot import known_robot
     from cloudrc.config.shipped import file_of
     from cloudrc.sim.camera import Camera
@@ -180,7 +183,7 @@ def draw() -> None:
         camera = Camera(model, at_rest(model), robot.camera)
     except MissingPrerequisiteError as error:
         print(error)
-        return
+        sys.exit(error.exit_code)
     camera.aim()
     camera.render()
     began = time.process_time()

@@ -68,6 +68,8 @@ DEFAULT_CLASS = "storageclass.kubernetes.io/is-default-class"
 """Annotation of the StorageClass of claims that name none."""
 IN_CLUSTER = "kubernetes.default.svc"
 """A name that each cluster resolves."""
+DRAWS = "python -c 'from cloudrc.cli.doctor import draw; draw()' > /dev/termination-log"
+"""Shell command of a container that tells how long it takes to draw a picture."""
 LOOKS_UP = ["python", "-I", "-S", "-c", LOOK_UP, IN_CLUSTER]
 """Command of a container that fails if it cannot resolve this name."""
 PROBE_LIMIT = 60.0
@@ -105,7 +107,7 @@ def survey(release: Release, values: Sequence[str] = ()) -> Iterator[Finding]:
     for component, spec in pods.items():
         yield admission(release, component, spec)
     yield from quotas(release, pods, counts_of_chart(rendered))
-    yield from nodes(release, pods)
+    yield from nodes(release, pods, draws=_has_camera(rendered))
 
 
 def permissions(release: Release) -> Finding:
@@ -156,15 +158,27 @@ def counts_of_chart(rendered: list[Any]) -> Counter[str]:
     return Counter({name: spec["replicas"] for name, spec in _specs(rendered).items()})
 
 
+def _configured(rendered: list[Any]) -> dict[str, str]:
+    """Return the files of the experiment and of the link profile that the pods get."""
+    files = dict[str, str]()
+    for thing in rendered:
+        if thing["kind"] == "ConfigMap":
+            files |= {key: thing["data"][key] for key in CONFIGURED if key in thing["data"]}
+    return files
+
+
+def _has_camera(rendered: list[Any]) -> bool:
+    """Return whether the robot's camera works in the experiment of the chart."""
+    experiment = yaml.safe_load(_configured(rendered).get(CONFIGURED[0], "")) or {}
+    return experiment.get("camera") is not None
+
+
 def experiments(rendered: list[Any]) -> Iterator[Finding]:
     """Load the experiment and the link of the chart, as the pods will."""
     from cloudrc.config.load import load_experiment, load_link
     from cloudrc.config.resolved import absolute_paths
 
-    files = dict[str, str]()
-    for thing in rendered:
-        if thing["kind"] == "ConfigMap":
-            files |= {key: thing["data"][key] for key in CONFIGURED if key in thing["data"]}
+    files = _configured(rendered)
     if len(files) < len(CONFIGURED):
         return
     experiment, profile = CONFIGURED
@@ -305,15 +319,20 @@ def _needed(
     return needed
 
 
-def nodes(release: Release, pods: dict[str, dict[str, Any]]) -> Iterator[Finding]:
-    """Start a probe on each node that takes pods; say what it found, and delete it."""
+def nodes(
+    release: Release, pods: dict[str, dict[str, Any]], *, draws: bool = False
+) -> Iterator[Finding]:
+    """Start a probe on each node that takes pods; say what it found, and delete it.
+
+    With `draws` it also tells how fast world's pod draws there.
+    """
     names = schedulable_nodes(release)
     if names is None:
         yield Finding("nodes", "warn", "you may not list nodes: one probe on any node", "")
     probes = dict[str, str]()
     try:
         for node in names if names is not None else [""]:
-            probes[node] = start_probe(release, node, pods)
+            probes[node] = start_probe(release, node, pods, draws=draws)
         until = time.monotonic() + PROBE_LIMIT
         for node, pod in probes.items():
             yield _finding(release, node or "any", pod, until)
@@ -341,10 +360,12 @@ def schedulable_nodes(release: Release) -> list[str] | None:
     ]
 
 
-def start_probe(release: Release, node: str, pods: dict[str, dict[str, Any]]) -> str:
+def start_probe(
+    release: Release, node: str, pods: dict[str, dict[str, Any]], *, draws: bool
+) -> str:
     """Create a probe with the images of `pods`: component -> spec; return its name."""
-    containers = [
-        {
+    containers: dict[str, dict[str, Any]] = {
+        component: {
             "name": component,
             "image": pod["containers"][0]["image"],
             "imagePullPolicy": "IfNotPresent",
@@ -354,11 +375,14 @@ def start_probe(release: Release, node: str, pods: dict[str, dict[str, Any]]) ->
             "securityContext": RESTRICTED,
         }
         for component, pod in pods.items()
-    ]
+    }
+    if draws:  # with the limits that world will have
+        resources = pods["world"]["containers"][0]["resources"]
+        containers["world"] |= {"command": ["sh", "-c", DRAWS], "resources": resources}
     spec = {
         "restartPolicy": "Never",
         "automountServiceAccountToken": False,
-        "containers": containers,
+        "containers": [*containers.values()],
         "imagePullSecrets": pods["cloud"].get("imagePullSecrets", []),
         **({"nodeName": node} if node else {}),
     }
@@ -371,7 +395,9 @@ def _finding(release: Release, node: str, pod: str, until: float) -> Finding:
     while time.monotonic() < until:
         found = release.request("get", "pods", name=pod)
         if found.status.phase == "Succeeded":
-            return Finding(name, "ok", "has the images")
+            ends = [each.state.terminated for each in container_statuses(found)]
+            said = [to_one_line(end.message) for end in ends if end and end.message]
+            return Finding(name, "ok", "; ".join(["has the images", *said]))
         if found.status.phase == "Failed":
             return _failed_probe(release, name, found)
         if why := pod_failure(found):

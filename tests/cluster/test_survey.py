@@ -27,7 +27,9 @@ FILES = """\
 apiVersion: v1
 kind: ConfigMap
 metadata: {name: files}
-data: {experiment.yaml: "cloud: {predictor: PREDICTOR}", profile.yaml: "profile: null"}
+data:
+  experiment.yaml: "{cloud: {predictor: PREDICTOR}, camera: PICTURES}"
+  profile.yaml: "profile: null"
 ---
 apiVersion: v1
 kind: Secret
@@ -39,7 +41,7 @@ metadata: {name: journal}
 spec: {storageClassName: CLASS}
 ---
 """
-SETTINGS = {"CLAIM": "journal", "PREDICTOR": "kalman", "CLASS": "gold"}
+SETTINGS = {"CLAIM": "journal", "PREDICTOR": "kalman", "CLASS": "gold", "PICTURES": "null"}
 SECURITY = 'pods "x" is forbidden: violates PodSecurity "restricted:latest"'
 
 
@@ -84,6 +86,20 @@ def test_a_cluster_that_is_fit_has_no_problem_and_keeps_no_pod(cluster, release)
     assert [one for one in seen.values() if one.state != "ok"] == []
     assert seen["node two"].found == "has the images"
     assert not [name for kind, name in cluster.objects if kind == "pods"]
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_a_node_tells_how_fast_it_draws_if_there_is_a_camera(
+    cluster, release, pretend, monkeypatch, camera
+):
+    pretend_chart(pretend, PICTURES="{}" if camera else "null")
+    cluster.put("nodes", {"metadata": {"name": "one"}, "spec": {}})
+    ended, commands = terminated(0, "3 ms for a picture" * camera), []
+    cluster.ended = pod("one", "world", state=ended, phase="Succeeded")["status"]
+    put = cluster.put
+    monkeypatch.setattr(cluster, "put", lambda *given: commands.append(given[1]) or put(*given))
+    assert found(release)["node one"].found == "has the images" + "; 3 ms for a picture" * camera
+    assert ("doctor import draw" in str(commands)) is camera
 
 
 def test_a_node_without_an_image_is_told(cluster, release):
