@@ -95,7 +95,7 @@ def _pod_arguments(run: Parser) -> None:
     )
     about = "bucket, or folder in it, in which the pods keep their rows"
     group.add_argument("--bucket", type=bucket, metavar="s3://NAME", help=about)
-    about = "image of the pods (default: cloudrc/world of this version, as the chart names it)"
+    about = "image of the pods (default: that of this version, as the chart names it)"
     group.add_argument("--image", metavar="IMAGE", help=about)
     about = "CPU request of a pod, such as 500m or 2 (default: 1)"
     group.add_argument("--cpu", default="1", metavar="CPU", help=about)

@@ -119,9 +119,11 @@ def _check(options: Options) -> SweepPlan:
     with Progress(f"checks {draft.size}"):
         plan = check(draft)
     if options.on:
+        from cloudrc.cluster.batch import image_for
         from cloudrc.cluster.own_files import check_size
 
-        _pods(options)
+        if _pods(options).image is None:
+            image_for(plan.points)  # there is one
         check_size(plan.own_files)
     warn_about(plan)
     return plan

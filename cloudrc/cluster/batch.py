@@ -12,9 +12,11 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from cloudrc.cluster.client import ClusterError, NoAnswerError, Release
+import yaml
+
+from cloudrc.cluster.client import ClusterError, NoAnswerError, Release, chart_folder
 from cloudrc.cluster.jobs import (
     JobReader,
     create_job,
@@ -23,9 +25,13 @@ from cloudrc.cluster.jobs import (
     find_job,
     read_example,
 )
+from cloudrc.config.problems import problem_at
 from cloudrc.errors import RejectedError, to_one_line
 from cloudrc.outside.document import KeyPath
 from cloudrc.text import suggest_name
+
+if TYPE_CHECKING:
+    from cloudrc.config.resolved import ResolvedExperiment
 
 COMPONENT = "sweep"
 """Label `component` of the Jobs and pods of sweeps, and name of their container."""
@@ -76,6 +82,25 @@ class PodSettings(NamedTuple):
         """Return where the pods of a Job keep their rows; None: in their logs alone."""
         above = self.bucket or (STORE if self.claim else "")
         return f"{above.rstrip('/')}/{name}" if above else None
+
+
+def image_for(points: Iterable[ResolvedExperiment]) -> str | None:
+    """Return the image that the experiments of a sweep need; None: that of the chart's example.
+
+    A camera needs the one that the chart's values name for it.
+    """
+    codecs = {each.camera.codec for each in points if each.camera is not None}
+    if "h264" in codecs:
+        text = "needs PyAV, which the image of pods does not have; choose jpeg, or name one of your"
+        raise problem_at("camera.codec", f"h264 {text} own that has it: --image")
+    if not codecs:
+        return None
+    chart = chart_folder()
+    image = yaml.safe_load((chart / "values.yaml").read_text("utf-8"))["image"]
+    own, version = image["worldCamera"], yaml.safe_load((chart / "Chart.yaml").read_text("utf-8"))
+    name = "/".join(filter(None, (image["registry"], own["repository"])))
+    tag = image["tag"] or version["appVersion"]
+    return f"{name}@{own['digest']}" if own["digest"] else f"{name}:{tag}"
 
 
 def unknown_field(changes: Iterable[KeyPath]) -> str:

@@ -33,6 +33,8 @@ def fly_in_pods(
     release = release.patient(tell)
     every = "".join(plan.flights).encode()
     name = f"sweep-{hashlib.sha256(every).hexdigest()[:12]}"
+    if settings.image is None:
+        settings = settings._replace(image=batch.image_for(plan.points))
     missing = {flight.key: flight for flight in flights}
     while missing:
         before = len(missing)

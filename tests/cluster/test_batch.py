@@ -13,6 +13,7 @@ from cloudrc.cluster import batch, client
 from cloudrc.cluster.batch import PodSettings
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import UID_LABEL
+from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from tests.cluster.conftest import pod, terminated
 from tests.conftest import nightly
@@ -61,6 +62,14 @@ def test_the_job_flies_each_index_with_its_flights(started, api, release):
     assert queued["metadata"]["labels"]["kueue.x-k8s.io/queue-name"] == "lab"
     pods = queued["spec"]["template"]["metadata"]["labels"]
     assert "kueue.x-k8s.io/queue-name" not in pods, "the queue takes the whole Job"
+
+
+def test_flights_with_a_camera_get_the_image_that_draws():
+    follow = load_experiment("follow")
+    assert batch.image_for([load_experiment("gap")]) is None
+    assert batch.image_for([follow]) == f"cloudrc/world-camera:{__version__}"
+    with pytest.raises(BadInputError, match="h264 needs PyAV"):
+        batch.image_for([follow, load_experiment("follow", ["camera.codec=h264"])])
 
 
 def test_the_flags_of_the_job_reach_it(api, release, tmp_path):
