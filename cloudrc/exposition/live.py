@@ -39,6 +39,7 @@ from cloudrc.records import (
     Control,
     Counted,
     Fault,
+    FrameSent,
     GuardChange,
     Lateness,
     LinkChecked,
@@ -190,6 +191,9 @@ class WorldEnd(End):
             self._set(
                 "cloudrc_sensor_value", record.sensor.name, {record.sensor.unit: record.force}
             )
+
+    def _on_framesent(self, record: FrameSent) -> None:
+        self._observe("camera", record.encode_ns * 1e-9)
 
     def _on_commandapplied(self, record: CommandApplied) -> None:
         self._basis_ns = record.basis_stamp_ns

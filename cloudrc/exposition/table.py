@@ -109,6 +109,8 @@ GAP_BUCKETS = (0.05, 0.25)
 two delays of which the mean is of interest: cloudrc_rtt_seconds has finer buckets."""
 DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 1.0)
 """Bounds for delays and ages [s]."""
+FRAME_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
+"""Bounds for the time that a picture takes [s]: 10 pictures a second allow 0.1 s each."""
 # fmt: off
 _TABLE = (
     LiveMetric(ROLES, GAUGE, "cloudrc_build_info",
@@ -210,6 +212,8 @@ _TABLE = (
     LiveMetric((WORLD,), COUNTER, "cloudrc_camera_late_total",
                "Pictures that were not taken, because the one before was still being rendered.",
                counted="frames_late"),
+    LiveMetric((WORLD,), HISTOGRAM, "cloudrc_camera_seconds",
+               "Time that rendering and encoding a picture took.", buckets=FRAME_BUCKETS),
     *_of_quantities(WORLD),
     LiveMetric((CLOUD,), HISTOGRAM, "cloudrc_uplink_delay_seconds",
                "One-way delay from world to cloud, late datagrams included; absent unless both "

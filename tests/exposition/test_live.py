@@ -16,6 +16,7 @@ from cloudrc.records import (
     CommandApplied,
     Contact,
     ContactForce,
+    FrameSent,
     GuardChange,
     Lateness,
     LinkChecked,
@@ -62,6 +63,12 @@ def test_command_age_is_that_of_its_odometry_in_track():
     live = seen("world", applied, *(told(100 * MS, guard) for guard in guards))
     age = live.read()["cloudrc_command_age_seconds"]
     assert (age.cumulative()[-1], age.total) == (1, pytest.approx(0.09))
+
+
+def test_pictures_tell_how_long_they_took():
+    taken = (FrameSent(k, 1, k, k, k * 10 * MS, k, 1, 9, True, 40.0) for k in (1, 3))
+    found = seen("world", *taken).read()["cloudrc_camera_seconds"]
+    assert (found.cumulative()[-1], found.total) == (2, pytest.approx(0.04))
 
 
 def test_control_periods_give_delays_errors_and_terms():
