@@ -303,6 +303,7 @@ site: $(VENV)/site ## build all pages into build/site; a link that leads nowhere
 	$(bin)/python -m tools.site pages build/pages
 	$(bin)/zensical build --strict --clean
 	$(bin)/python -m tools.site plain build/pages build/site
+	$(bin)/python -m tools.fly_here build/site/fly-here/index.html
 	$(bin)/python -m tools.site check build/site
 	$(bin)/python -m tools.words
 

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""The page "fly it here": its flights, its size, and how it works in a browser."""
+
+import functools
+import http.server
+import threading
+
+import numpy as np
+import pytest
+
+import cloudrc
+from tools.fly_here.flights import EXPERIMENT, RATE_HZ, RECIPES, SEED, Recipe, document, fly, hull
+from tools.fly_here.page import BYTES_MAX, write
+
+LOSSY = Recipe("lossy", "last_sample", 300)
+READY = "body[data-ready]"
+SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """The page with all its flights, as `make site` makes it."""
+    target = tmp_path_factory.mktemp("site") / "index.html"
+    write(target, document(RECIPES))
+    return target
+
+
+@pytest.fixture
+def served(page):
+    """Address of the page on a server of this machine."""
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *words):
+            pass
+
+    handler = functools.partial(Quiet, directory=page.parent)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/index.html"
+        server.shutdown()
+
+
+def opened(browse, url, size="desktop", scheme="light"):
+    """Open the page in a size and a colour scheme, at its end and without a network."""
+    shown = browse(url)
+    shown.emulate_media(color_scheme=scheme, reduced_motion="reduce")
+    width, height = SIZES[size]
+    shown.set_viewport_size({"width": width, "height": height})
+    shown.context.set_offline(True)
+    shown.reload()
+    shown.wait_for_selector(READY)
+    return shown
+
+
+def test_some_60_recipes_cover_all_that_the_page_offers():
+    kinds = [set(column) for column in zip(*RECIPES, strict=True)]
+    assert [len(kind) for kind in kinds] == [3, 3, 7]
+    assert len(set(RECIPES)) == 63
+    assert (min(kinds[2]), max(kinds[2])) == (0, 600)
+
+
+@pytest.mark.filterwarnings("ignore:commands follow their odometry")  # HOLD is wanted here
+def test_a_track_is_the_flight_to_half_a_centimetre_with_its_verdict_and_ages():
+    shown = fly(LOSSY)
+    result = cloudrc.fly(EXPERIMENT, LOSSY.settings, seed=SEED)
+    positions = np.cumsum(shown["robot"], axis=1).T / 100
+    at_ns = result.flight.mission_ns + np.arange(len(positions)) * 10**9 // RATE_HZ
+    assert np.abs(positions - result.flight.true_position(at_ns)).max() <= 0.0051
+    assert (shown["verdict"], shown["text"]) == ("failure", "it touched pipe_1")
+    assert result.failures[0].text.startswith("the robot touched pipe_1")
+    applied = result.flight.during("/command_applied")
+    row = applied["stamp_ns"].searchsorted(at_ns, "right") - 1
+    behind_ms, shown_ms = (
+        (at_ns - applied["basis_stamp_ns"][row]) / 1e6,
+        10 * np.array(shown["age"]),
+    )
+    is_used = shown_ms >= 0
+    assert 0 < is_used.sum() < len(is_used), "with HOLD"
+    assert np.abs(behind_ms - shown_ms)[is_used].max() <= 5.1
+    assert len(shown["age"]) == len(positions)
+
+
+def test_the_outline_of_a_square_has_its_four_corners():
+    inside = [(0.5, 0.5), (1.0, 0.5)]
+    corners = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
+    assert hull(np.array([*inside, *corners])) == [list(each) for each in corners]
+
+
+def test_a_page_that_is_too_heavy_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("tools.fly_here.page.BYTES_MAX", 1000)
+    with pytest.raises(SystemExit, match="above 1000"):
+        write(tmp_path / "index.html", {})
+
+
+@pytest.mark.process
+@pytest.mark.alone
+def test_the_first_picture_comes_within_a_second(browse, page, served):
+    assert page.stat().st_size <= BYTES_MAX
+    shown = browse(served)
+    shown.wait_for_selector(READY)
+    marks = shown.evaluate("performance.getEntries().map(one => [one.name, one.startTime])")
+    assert max(dict(marks)[name] for name in ("first-contentful-paint", "drawn")) <= 1000
+
+
+@pytest.mark.process
+@pytest.mark.alone
+@pytest.mark.parametrize("size", SIZES)
+def test_it_flies_from_a_file_without_a_network(browse, page, size):
+    shown = opened(browse, page.as_uri(), size)
+    assert shown.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    told = shown.locator("#told")
+    choices = shown.get_by_role("form", name="flight A")
+    choices.get_by_role("slider").fill("0")
+    choices.get_by_label("last_sample").check()
+    assert "A with last_sample arrives after" in told.inner_text()
+    choices.get_by_role("slider").press("End")
+    assert "round trip 600\u00a0ms.\nA with last_sample fails" in told.inner_text()
+    assert "B with model_based arrives after" in told.inner_text()
+    before = pixels(shown)
+    shown.keyboard.press("Space")
+    shown.get_by_role("button", name="Pause").click()
+    shown.locator("#time").fill("1")
+    assert all(now != then for now, then in zip(pixels(shown), before, strict=True))
+    choices.get_by_label("lossy").check()
+    address = shown.url
+    shown.goto("about:blank")
+    shown.goto(address)
+    shown.wait_for_selector(READY)
+    assert shown.locator("form.B [value=lossy]").is_checked()
+
+
+def pixels(shown):
+    """Return the pixels of both flights."""
+    return shown.evaluate(
+        "[...document.querySelectorAll('.view canvas')].map(one => one.toDataURL())"
+    )
+
+
+CONTRAST = """() => {
+  const parse = (text) => text.match(/[\\d.]+/g).map(Number);
+  const light = (rgb) => rgb.slice(0, 3).map((part) => part / 255)
+    .map((part) => part <= 0.04045 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, part, which) => sum + part * [0.2126, 0.7152, 0.0722][which], 0);
+  const ground = (element) => {
+    const found = parse(getComputedStyle(element).backgroundColor);
+    return found[3] === 0 && element.parentElement ? ground(element.parentElement) : found; };
+  const ratio = (one, other) => (Math.max(one, other) + 0.05) / (Math.min(one, other) + 0.05);
+  const poor = [], style = getComputedStyle(document.documentElement);
+  const named = (name) => light([1, 3, 5].map((at) =>
+    parseInt(style.getPropertyValue(`--${name}`).trim().slice(at, at + 2), 16)));
+  for (const name of ['young', 'old', 'hold', 'ghost', 'fails', 'ink'])
+    for (const behind of ['paper', 'wall'])
+      if (ratio(named(name), named(behind)) < 3) poor.push(`${name} on ${behind}`);
+  for (const element of document.querySelectorAll('body *')) {
+    const has_text = [...element.childNodes].some((one) => one.nodeType === 3 && one.data.trim());
+    if (!has_text || !element.getClientRects().length) continue;
+    const both = [parse(getComputedStyle(element).color), ground(element)].map(light);
+    if (ratio(...both) < 4.5) poor.push(`${element.outerHTML.slice(0, 60)} ${ratio(...both)}`);
+  }
+  return poor; }"""
+"""What has less contrast than WCAG 2.2 asks for, level AA: texts (1.4.3) and drawings (1.4.11)."""
+
+
+@pytest.mark.process
+@pytest.mark.alone
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_texts_and_drawings_have_the_contrast_of_wcag_aa(browse, page, scheme):
+    shown = opened(browse, page.as_uri(), scheme=scheme)
+    shown.locator("summary").click()
+    assert shown.evaluate(CONTRAST) == []
