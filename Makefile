@@ -280,7 +280,7 @@ bench: $(VENV)/dev ## measure flights of all kinds beside steps; AGAINST=COMMIT:
 bench-cell: $(VENV)/all ## measure how punctual the cell of 50 robots is
 	$(bin)/python -m tools.bench_cell $(BENCH_CELL)
 
-results: $(VENV)/dev ## fly the results of docs/results.md and docs/link.md, and write them there; needs EGL: an hour
+results: $(VENV)/dev ## fly the results of docs/results.md, docs/reproduce.md and docs/link.md; needs EGL: an hour
 	$(bin)/python -m tools.results
 	$(bin)/python -m tools.radio
 	$(bin)/python -m tools.eyes

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Write the table and the pictures of results in docs/results.md: `make results` takes minutes.
+"""Write tables and pictures of docs/results.md, docs/reproduce.md and README.md: `make results`.
 
 A nightly test flies again: each number in the table must lie within the interval of its sweep.
 """
@@ -17,6 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from cloudrc.reproduce.table import as_markdown, summary
 from cloudrc.statistics import median_interval
 from tools.docs import insert
 from tools.markdown import table
@@ -26,6 +27,8 @@ PAGE, SWEEPS = ROOT / "docs" / "results.md", ROOT / "docs" / "sweeps"
 LINKS = "paper-p3", "far"
 """Link profiles in `predictors.yaml`."""
 ERROR = "prediction_error_rms"
+IN_README = 2, 3, 4, 5, 6
+"""Numbers of the paper's statements in README.md."""
 
 
 def cloudrc(*words: str | Path) -> None:
@@ -71,6 +74,15 @@ def draw_policy(folder: Path) -> None:
     shutil.copy(folder / "policy" / "figure.png", ROOT / "docs" / "survival.png")
 
 
+def beside_the_paper(folder: Path) -> dict[Path, str]:
+    """Return the pages that show the statements of the paper, after `cloudrc reproduce`."""
+    document = json.loads((folder / "reproduce.json").read_text())
+    return {
+        **insert(ROOT / "docs" / "reproduce.md", f"\n{as_markdown(document)}"),
+        **insert(ROOT / "README.md", f"\n{summary(document, IN_README)}\n\n"),
+    }
+
+
 def main() -> None:
     """Fly both sweeps and play a policy; write the table and the pictures of the page."""
     with TemporaryDirectory() as folder:
@@ -83,7 +95,11 @@ def main() -> None:
         cloudrc("sweep", "figure", delay, "--number", ERROR, "--by", "predictor")
         shutil.copy(delay / "figure.png", ROOT / "docs" / "delay.png")
         draw_policy(Path(folder))
-    PAGE.write_text(insert(PAGE, made)[PAGE], encoding="utf-8")
+        cloudrc("reproduce", "-o", paper := Path(folder, "paper"))
+        shutil.copy(paper / "reproduce.png", ROOT / "docs" / "reproduce.png")
+        pages = beside_the_paper(paper)
+    for page, text in {**pages, **insert(PAGE, made)}.items():
+        page.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -45,6 +45,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "place": "find out where the controller should run: robot, edge or cloud",
         "measure": "measure how long a controller computes",
         "identify": "fit the model of the velocity loop to a recorded flight",
+        "reproduce": "put the statements of the paper beside what is measured here",
         "bench": "measure how fast the simulation runs here",
     },
     "policies": {

@@ -73,10 +73,10 @@ def round_trips(flight: Flight) -> Columns:
     return select(rows, rows["is_first"])
 
 
-def delay_samples(flight: Flight) -> Array:
-    """Return the loop delays that the estimator got as samples [s], in order of arrival."""
+def estimator_samples(flight: Flight) -> Columns:
+    """Return the rows of `_echoes` that the estimator got as samples."""
     rows = _echoes(flight)
-    return np.asarray(rows["loop_delay"][rows["is_sample"]])
+    return select(rows, rows["is_sample"])
 
 
 def _age_of_information(flight: Flight) -> float | None:
@@ -242,7 +242,7 @@ add_measures(
     ("rtt_mean", lambda flight: round_trips(flight)["rtt"], "mean"),
     ("rtt_p95", lambda flight: round_trips(flight)["rtt"], "p95"),
     ("loop_delay_mean", lambda flight: round_trips(flight)["loop_delay"], "mean"),
-    ("delay_sample_mean", delay_samples, "mean"),
+    ("delay_sample_mean", lambda flight: estimator_samples(flight)["loop_delay"], "mean"),
     ("age_of_information_mean", _age_of_information),
     ("age_at_actuator_mean", partial(_age, "mean")),
     ("age_at_actuator_p99", partial(_age, "p99")),

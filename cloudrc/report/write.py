@@ -32,7 +32,7 @@ from cloudrc.report.document import (
 from cloudrc.report.flown import flight_of, flown_shapes, flown_world
 
 if TYPE_CHECKING:
-    from cloudrc.report.figures.style import Look
+    from cloudrc.report.figures.style import Look, Subject
 
 
 UNKNOWN = "No clearance is known from"
@@ -174,14 +174,10 @@ def _draw(
 ) -> None:
     """Draw a run; write report.html, the files in figures/, or both."""
     from cloudrc.report.figures import PAGE_KINDS, PRINT_KINDS, draw_all, draw_still
-    from cloudrc.report.figures.style import Look, Subject
     from cloudrc.report.page import render
     from cloudrc.report.polar import write_polar
 
-    flown = assessment.experiment
-    shapes = flown_shapes(assessment.flight.recording, flown)
-    ways, start = (flown.uplink, flown.downlink), link_start(flown) or 0.0
-    subject = Subject(assessment.flight, *ways, look or Look(), shapes, start, flown.faults)
+    subject = subject_of(assessment, look)
     pictures = draw_all(subject, PRINT_KINDS if figures else PAGE_KINDS)
     if figures:
         if (target := folder / "figures").is_symlink():
@@ -195,6 +191,16 @@ def _draw(
         moving = _replay(assessment), write_polar(assessment.flight)
         text = render(assessment, pictures, environment, *moving, still)
         write_atomically(folder / "report.html", text.encode("utf-8"))
+
+
+def subject_of(assessment: Assessment, look: Look | None = None) -> Subject:
+    """Return what figures of a run show; `look` is their size."""
+    from cloudrc.report.figures.style import Look, Subject
+
+    flown = assessment.experiment
+    shapes = flown_shapes(assessment.flight.recording, flown)
+    ways, start = (flown.uplink, flown.downlink), link_start(flown) or 0.0
+    return Subject(assessment.flight, *ways, look or Look(), shapes, start, flown.faults)
 
 
 def _replay(assessment: Assessment) -> str:

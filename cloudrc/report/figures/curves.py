@@ -38,27 +38,42 @@ def draw_delay(subject: Subject) -> Figure:
     The bands are the limits of the link profile in force, if they are known.
     """
     figure, (one_way, loop) = subject.look.two_panels()
-    flight, time = subject.flight, np.linspace(0.0, subject.flight.duration, 600)
+    flight, time = subject.flight, _steps(subject)
     panel(one_way, "a")
     for name, colour in (("uplink", style.UPLINK), ("downlink", style.DOWNLINK)):
         arrivals = flight.during(f"/{name}_delay")
         dots(one_way, flight.seconds(arrivals["stamp_ns"]), arrivals["delay"] * 1e3, colour, name)
-    known = [bounds(subject, time, uplink=uplink) for uplink in (True, False)]
-    for each, label in zip(known, ("profile", "_"), strict=True):
+    for each, label in zip(_limits(subject), ("profile", "_"), strict=True):
         _fill(one_way, time, each, label)
     _finish_delay(one_way, subject, "one-way delay (ms)")
 
     panel(loop, "b")
-    echoes, total = round_trips(flight), np.sum(known, axis=0)
-    time_of = flight.seconds(echoes["stamp_ns"])
-    dots(loop, time_of, echoes["loop_delay"] * 1e3, style.SKY, "loop delay")
-    horizon = flight.control["horizon"] * 1e3
-    loop.plot(subject.times, horizon, color=style.BLACK, label="estimate", zorder=4)
-    _fill(loop, time, total, "profile")
-    mean = total.mean(axis=0)
-    loop.plot(time, mean, color=style.GREEN, lw=0.8, ls="--", label="mean", zorder=3)
-    _finish_delay(loop, subject, "loop delay (ms)")
+    draw_loop(loop, subject)
     return figure
+
+
+def _steps(subject: Subject) -> Array:
+    """Return the times at which the limits of the link profile are drawn [s]."""
+    return np.linspace(0.0, subject.flight.duration, 600)
+
+
+def _limits(subject: Subject) -> list[Array]:
+    """Return the limits of uplink and downlink [ms], each of shape (2, n), at n `_steps`."""
+    return [bounds(subject, _steps(subject), uplink=uplink) for uplink in (True, False)]
+
+
+def draw_loop(axes: Axes, subject: Subject) -> None:
+    """Draw the loop delay of each echo, cloud's estimate of it, and both directions' limits."""
+    flight, time, total = subject.flight, _steps(subject), np.sum(_limits(subject), axis=0)
+    echoes = round_trips(flight)
+    time_of = flight.seconds(echoes["stamp_ns"])
+    dots(axes, time_of, echoes["loop_delay"] * 1e3, style.SKY, "loop delay")
+    horizon = flight.control["horizon"] * 1e3
+    axes.plot(subject.times, horizon, color=style.BLACK, label="estimate", zorder=4)
+    _fill(axes, time, total, "profile")
+    mean = total.mean(axis=0)
+    axes.plot(time, mean, color=style.GREEN, lw=0.8, ls="--", label="mean", zorder=3)
+    _finish_delay(axes, subject, "loop delay (ms)")
 
 
 def _fill(axes: Axes, time: Array, limits: Array, label: str) -> None:
@@ -76,12 +91,13 @@ def _finish_delay(axes: Axes, subject: Subject, label: str) -> None:
 def _finish(axes: Axes, subject: Subject, label: str) -> None:
     """Complete a panel over time: marks of events, labels of the axes, legend."""
     mark_events(axes, subject)
-    _time_axis(axes, subject)
+    time_axis(axes, subject)
     axes.set_ylabel(label)
     legend_above(axes)
 
 
-def _time_axis(axes: Axes, subject: Subject) -> None:
+def time_axis(axes: Axes, subject: Subject) -> None:
+    """Let the axis along x have the time of the flight."""
     axes.set_xlim(0.0, max(subject.flight.duration, 1e-3))
     axes.set_xlabel(TIME)
 
@@ -115,16 +131,13 @@ def draw_odom(subject: Subject) -> Figure:
     mosaic: list[Any] = [[name, "step"] if step else [name] for name in names]
     panels = figure.subplot_mosaic(mosaic, width_ratios=(4.0, 1.2) if step else None)
     rows = [panels[name] for name in names]
-    for index, (axes, name) in enumerate(zip(rows, names, strict=True)):
+    for index, axes in enumerate(rows):
         panel(axes, "abc"[index])
-        _draw_position(axes, subject, index)
-        mark_events(axes, subject)
-        axes.set_ylabel(f"${name}$ (m)")
-        axes.margins(y=0.12)
+        draw_position(axes, subject, index)
     for axes in rows[:-1]:
         axes.sharex(rows[-1])
         axes.tick_params(labelbottom=False)
-    _time_axis(rows[-1], subject)
+    time_axis(rows[-1], subject)
     legend_above(rows[0])
     figure.align_ylabels(rows)
     if step:
@@ -132,6 +145,14 @@ def draw_odom(subject: Subject) -> Figure:
         panel(panels["step"], "abcd"[len(names)], f"step of ${names[index]}$ (m)")
         _draw_step(panels["step"], subject, index, begin)
     return figure
+
+
+def draw_position(axes: Axes, subject: Subject, index: int) -> None:
+    """Draw a panel of the position along one axis of the world, 0 to 2."""
+    _draw_position(axes, subject, index)
+    mark_events(axes, subject)
+    axes.set_ylabel(f"${'xyz'[index]}$ (m)")
+    axes.margins(y=0.12)
 
 
 def _draw_position(axes: Axes, subject: Subject, index: int, rows: Any = slice(None)) -> None:
@@ -174,15 +195,9 @@ ERROR = (
 def draw_error(subject: Subject) -> Figure:
     """Draw the distance to the setpoint and, in a second panel, the errors of the estimates."""
     figure, (tracking, accuracy) = subject.look.two_panels()
-    flight, control = subject.flight, subject.flight.control
-
+    flight = subject.flight
     panel(tracking, "a")
-    for column in ("measured", "position"):
-        error = tracking_errors(flight, control[column])
-        look = LINES[column] | {"label": f"{LINES[column]['label']}{_rms(error, 'm', 1.0)}"}
-        tracking.plot(subject.times, np.linalg.norm(error, axis=1), **look)
-    tracking.set_ylim(bottom=0.0)
-    _finish(tracking, subject, "distance to reference (m)")
+    draw_tracking(tracking, subject)
 
     panel(accuracy, "b")
     _, instants_ns, error = prediction_errors(flight)
@@ -191,6 +206,16 @@ def draw_error(subject: Subject) -> Figure:
     accuracy.set_ylim(bottom=0.0)
     _finish(accuracy, subject, "distance to truth (mm)")
     return figure
+
+
+def draw_tracking(axes: Axes, subject: Subject) -> None:
+    """Draw the distances from the reference to the measured and to the estimated position."""
+    for column in ("measured", "position"):
+        error = tracking_errors(subject.flight, subject.flight.control[column])
+        look = LINES[column] | {"label": f"{LINES[column]['label']}{_rms(error, 'm', 1.0)}"}
+        axes.plot(subject.times, np.linalg.norm(error, axis=1), **look)
+    axes.set_ylim(bottom=0.0)
+    _finish(axes, subject, "distance to reference (m)")
 
 
 def _rms(error: Array, unit: str, scale: float) -> str:
