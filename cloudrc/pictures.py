@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cloudrc.errors import MissingPrerequisiteError
 
 if TYPE_CHECKING:
-    from cloudrc.config.camera import CameraConfig, CodecConfig
+    from cloudrc.config.camera import CodecConfig
 
 Image: TypeAlias = NDArray[np.uint8]
 """A picture: red, green, blue, shape (height, width, 3)."""
@@ -47,16 +47,17 @@ class Jpeg:
 
     def __init__(self, quality: int = 70) -> None:
         """Set the quality, as Pillow counts it."""
-        self._pillow, self._quality = _pillow(), quality
+        self._quality = quality
+        _pillow()  # a lack is told here; an attribute of a module could not be copied
 
     def encode(self, image: Image) -> Encoded:
         """Encode a picture."""
-        return Encoded(_written(self._pillow, image, "JPEG", quality=self._quality), True)
+        return Encoded(_written(_pillow(), image, "JPEG", quality=self._quality), True)
 
     def decode(self, data: bytes) -> Image | None:
         """Decode a picture."""
         try:
-            return np.asarray(self._pillow.open(io.BytesIO(data)).convert("RGB"))
+            return np.asarray(_pillow().open(io.BytesIO(data)).convert("RGB"))
         except (OSError, SyntaxError):
             return None
 
@@ -64,16 +65,17 @@ class Jpeg:
 class H264Encoder:
     """Encodes pictures with x264, without a delay; all but the key frames need the one before."""
 
-    def __init__(self, codec: CodecConfig, camera: CameraConfig) -> None:
-        """Set bit rate and key frames of `codec`, and size and rate of the `camera`'s pictures."""
+    def __init__(self, codec: CodecConfig, width: int, height: int, rate_hz: float) -> None:
+        """Set bit rate and key frames of `codec`, and size and rate of the pictures."""
         self._av, rate = _av(), f"{codec.kbit}k"
         self._context = made = self._av.CodecContext.create("libx264", "w")
-        made.width, made.height, made.pix_fmt = camera.width, camera.height, "yuv420p"
-        made.time_base, made.framerate = Fraction(1, camera.fps), camera.fps
+        made.width, made.height, made.pix_fmt = width, height, "yuv420p"
+        made.framerate = Fraction(rate_hz).limit_denominator(1000)
+        made.time_base = 1 / made.framerate
         made.thread_count = 1  # with more, bytes would differ between machines
         made.options = {
             **{"preset": "veryfast", "tune": "zerolatency", "sc_threshold": "0"},
-            "g": str(max(1, round(codec.key_every_s * camera.fps))),
+            "g": str(max(1, round(codec.key_every_s * rate_hz))),
             **{"b": rate, "maxrate": rate, "bufsize": f"{max(1, codec.kbit // 4)}k"},
         }
         self._count = 0
@@ -106,13 +108,15 @@ class H264Decoder:
         return image
 
 
-def make_encoder(codec: CodecConfig, camera: CameraConfig) -> Encoder:
-    """Make the encoder of a session.
+def make_encoder(codec: CodecConfig, width: int, height: int, rate_hz: float) -> Encoder:
+    """Make the encoder of a session, whose pictures have one size and come at a rate.
 
     Raises:
         MissingPrerequisiteError: If its package is not installed.
     """
-    return Jpeg(codec.quality) if codec.codec == "jpeg" else H264Encoder(codec, camera)
+    if codec.codec == "jpeg":
+        return Jpeg(codec.quality)
+    return H264Encoder(codec, width, height, rate_hz)
 
 
 def make_decoder(codec: str) -> Decoder:

@@ -53,10 +53,11 @@ def build_film(
     from cloudrc.world.filming import Film
 
     camera = Camera(robot.simulator.model, robot.simulator.data, config)
+    kind = config.width, config.height, config.fps
     worker = make_worker() if make_worker is not None else None
     return Film(
         camera,
-        lambda: (make_encoder(codec, config), make_decoder(codec.codec)),
+        lambda: (make_encoder(codec, *kind), make_decoder(codec.codec)),
         worker,
         robot.guard.counts,
     )

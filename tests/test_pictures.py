@@ -9,11 +9,11 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from cloudrc.config.camera import CameraConfig, CodecConfig
+from cloudrc.config.camera import CodecConfig
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.pictures import as_png, make_decoder, make_encoder, psnr
 
-CAMERA = CameraConfig(name="front", width=160, height=120, fps=10)
+KIND = (160, 120, 10)
 
 
 def picture(k):
@@ -24,7 +24,7 @@ def picture(k):
 
 
 def coded(codec, count=12):
-    encoder, decoder = make_encoder(codec, CAMERA), make_decoder(codec.codec)
+    encoder, decoder = make_encoder(codec, *KIND), make_decoder(codec.codec)
     for k in range(count):
         encoded = encoder.encode(picture(k))
         yield encoded, decoder.decode(encoded.data), picture(k)
@@ -62,7 +62,7 @@ def test_what_is_no_picture_is_none(name):
 def test_a_codec_that_is_not_installed_is_told_in_one_line(name, module, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingPrerequisiteError, match=r"pip install 'cloudrc\[camera\]'$"):
-        make_encoder(CodecConfig(codec=name), CAMERA)
+        make_encoder(CodecConfig(codec=name), *KIND)
 
 
 def test_psnr_and_png_by_hand():

@@ -9,6 +9,12 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from cloudrc.config.section import Section
+from cloudrc.outside.values import Quantity
+
+QUALITY = Quantity(ge=1, le=95, whole=True)
+"""Quality of JPEG, as Pillow counts it."""
+KBIT = Quantity("kbit/s", 10, 100_000, whole=True)
+"""Bit rate of H.264."""
 
 
 class CameraConfig(Section):
@@ -33,9 +39,9 @@ class CodecConfig(Section):
     codec: Literal["jpeg", "h264"] = "jpeg"
     """jpeg: each picture stands alone; h264: most hold what differs from the one before, so that
     after a loss cloud waits for the next key frame. h264 needs the extra `camera`"""
-    quality: Annotated[int, Field(ge=1, le=95)] = 70
+    quality: Annotated[int, QUALITY] = 70
     """Quality of JPEG, as Pillow counts it"""
-    kbit: Annotated[int, Field(ge=10, le=100_000)] = 800
+    kbit: Annotated[int, KBIT] = 800
     """Mean and largest bit rate of H.264 [kbit/s]"""
     key_every_s: Annotated[float, Field(ge=0.01, le=60)] = 1.0
     """Time between two key frames of H.264 [s]"""
