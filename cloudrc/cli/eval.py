@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -48,6 +49,8 @@ def arguments(parser: Parser) -> None:
     _episode_arguments(parser)
     about = "size of an observation on the wire (default: that of its arrays)"
     parser.add_argument("--observation-bytes", type=whole_number(0, 10**9), metavar="N", help=about)
+    about = "how images travel: jpeg, jpeg:QUALITY, h264 or h264:KBIT (default: as they are)"
+    parser.add_argument("--codec", metavar="CODEC", help=about)
     about = "what of a message arrives (default: stream for a server, else datagrams)"
     parser.add_argument("--delivery", choices=("datagrams", "stream"), help=about)
     about = "most bytes of a packet; what is larger is several packets (default: 1200)"
@@ -216,7 +219,8 @@ def _report(
 
     found = judge(rows, before, *known) | known._asdict()
     for outcome in found["outcomes"][1:]:
-        outcome |= setup.sent
+        mean = outcome.get("observation_bytes")  # with a codec, sizes differ
+        outcome |= (setup if mean is None else replace(setup, sent_bytes=round(mean))).sent
     found["time_line"] = met = find_met(setup, rows)
     found["notes"] += describe_met(met) if met else []
     found["success"] = results.describe_success(setup, found["outcomes"])
@@ -253,6 +257,7 @@ def _read(options: Options) -> tuple[EvalSetup, list[Episode]]:
         observe_step=options.observe_step,
         robots=options.robots,
         channel=values.read_channel(options.channel, options.robots),
+        codec=values.read_codec(options.codec, options.observation_bytes),
     )
     values.check_policy(setup.policy)
     values.check_rows(options.rows)

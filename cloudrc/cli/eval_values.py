@@ -145,6 +145,20 @@ def _pairs(flag: str, texts: list[str], example: str) -> dict[str, Any]:
     return found
 
 
+def read_codec(text: str | None, observation_bytes: int | None) -> str | None:
+    """Check a codec of images; the size of an observation is then not to be said."""
+    if text is None:
+        return None
+    from cloudrc.gym import options  # here, because it imports gymnasium
+
+    options.read_codec(text, "--codec")
+    if observation_bytes is not None:
+        raise BadInputError(
+            "--codec says how large an observation is; leave --observation-bytes out"
+        )
+    return text
+
+
 def read_channel(path: Path | None, robots: int) -> SharedChannel | None:
     """Read the file of a channel that so many `robots` share."""
     if (path is None) != (robots == 1):

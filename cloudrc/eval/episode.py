@@ -104,6 +104,8 @@ def numbers_of(loop: Mapping[str, Any]) -> dict[str, float]:
         found |= {f"{name}_{way}": loop[way][name] for name in ("delay_asked", "delay_measured")}
         found[f"loss_{way}"] = loop[way]["loss_measured"]
         found |= {f"{name}_{way}": loop[way][name] for name in ("packets_sent", "packets_lost")}
+    if (shown := loop["uplink"].get("shown")) is not None:  # with a codec
+        found |= {"frames_shown": shown, "observation_bytes": loop["uplink"]["bytes"]}
     return found
 
 
@@ -269,14 +271,16 @@ def options_of(
     count: int,
 ) -> dict[str, Any]:
     """Return the options of the loop of a policy, which has answered with `count` actions."""
-    sent = setup.observation_bytes
+    sent = setup.sent_bytes if setup.codec else setup.observation_bytes
+    if sent is None and not setup.codec:
+        sent = policy.size
     return {
         "compute": policy.duration if setup.is_measured else setup.compute_times,
         "answer_within": setup.answer_within,
         "deadline": setup.deadline,
         "chunk": count,
         "executor": episode.chosen,
-        "observation_bytes": policy.size if sent is None else sent,
+        "observation_bytes": sent,
         "delivery": setup.delivery,
         "packet_bytes": setup.packet_bytes,
         **beginning(setup, env),
@@ -294,7 +298,8 @@ def beginning(setup: EvalSetup, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
             except PolicyAnswerError as error:
                 raise InvalidValueError(str(error)) from None
     dt = setup.step.seconds if setup.step else setup.dt
-    return {"dt": dt, "start": start, "hold": setup.hold, **setup.memory}
+    given = {"dt": dt, "start": start, "hold": setup.hold, "codec": setup.codec}
+    return {**given, **setup.memory}
 
 
 @contextmanager
@@ -345,8 +350,10 @@ def check_environment(setup: EvalSetup, episodes: list[Episode]) -> tuple[EvalSe
 def _first_observation(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> tuple[str, int]:
     """Return hash and size [bytes] of the observation with which the seed 1 begins."""
     witness = Witness(env)
-    observation, _ = Networked(witness, **beginning(setup, env)).reset(seed=1)
-    return witness.digest.hexdigest(), _sent_size(observation, setup)
+    first = Networked(witness, **beginning(setup, env))
+    observation, _ = first.reset(seed=1)
+    size = first.observation_bytes if setup.codec else _sent_size(observation, setup)
+    return witness.digest.hexdigest(), size
 
 
 def _sent_size(observation: Any, setup: EvalSetup) -> int:

@@ -28,7 +28,7 @@ WEIGHTS = {
     **dict.fromkeys(("observation_age_peak", "action_age_peak")),
     **dict.fromkeys(("delay_asked_uplink", "delay_asked_downlink")),
     **dict.fromkeys(("delay_measured_uplink", "delay_measured_downlink")),
-    **dict.fromkeys(("loss_uplink", "loss_downlink")),
+    **dict.fromkeys(("loss_uplink", "loss_downlink", "frames_shown", "observation_bytes")),
 }
 """Number of an episode whose mean a summary has -> steps that it is of; None: episodes count."""
 LARGEST = (

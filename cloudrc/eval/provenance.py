@@ -14,6 +14,7 @@ from cloudrc import source
 from cloudrc.eval.setup import EvalSetup
 from cloudrc.link.library import read_profile
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.pictures import describe_codec
 from cloudrc.report.document import versions
 from cloudrc.version import __version__
 
@@ -35,6 +36,7 @@ def provenance(setup: EvalSetup, command: str) -> dict[str, Any]:
         "versions": {
             "python": platform.python_version(),
             **versions(["cloudrc", *(each for each in (*LIBRARIES, top) if each in sys.modules)]),
+            **({"codec": describe_codec(setup.codec.partition(":")[0])} if setup.codec else {}),
         },
         "command": command,
         "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",

@@ -49,9 +49,10 @@ PAIRED = (
     "robots",
     "channel",
     "schedule",
+    "codec",
 )
 """What two evaluations must share for a comparison of their policies."""
-FLAGS = {"delivery": "--delivery", "packet_bytes": "--packet-bytes"}
+FLAGS = {"delivery": "--delivery", "packet_bytes": "--packet-bytes", "codec": "--codec"}
 """Of these, how the flags are called that people have to give."""
 LEGEND = (
     "loop: time from an observation to its action; ended: terminated/truncated/by --max-steps; "
@@ -63,6 +64,7 @@ COLUMNS = {
     "loop": "{loop_age_ms:.0f} ms",
     "executor": "{executor}",
     "on link": "{observation_bytes:,} B, {on_link_ms:g} ms",
+    "shown": "{frames_shown:.1%}",
     "return": "{return:.5g}",
     "95 %": "{return_low:.5g} .. {return_high:.5g}",
     "success": "{successes}/{episodes}",
@@ -206,6 +208,7 @@ def write(folder: Path, setup: EvalSetup, found: Mapping[str, Any]) -> dict[str,
         "delivery": setup.delivery,
         "packet_bytes": setup.packet_bytes,
         **setup.sent,
+        **({"codec": setup.codec} if setup.codec else {}),
         "repeatable": setup.is_repeatable,
         "code": source.code_hash(),
         "identity": setup.identity(),

@@ -41,6 +41,7 @@ BARE: dict[str, Any] = {
     "delivery": DATAGRAMS,
     "packet_bytes": PACKET_BYTES,
     "sent_bytes": None,
+    "codec": None,
 }
 """What these episodes have in place of the values of the setup."""
 
@@ -87,6 +88,7 @@ class EvalSetup:
     observe_step: bool = False
     robots: int = 1  # that play an episode together
     channel: SharedChannel | None = None  # that they share
+    codec: str | None = None  # of the images of an observation, as `Networked` takes it
 
     @property
     def is_remote(self) -> bool:
@@ -136,6 +138,8 @@ class EvalSetup:
         text = f"step {self.step}, observations of {self.sent_bytes:,} bytes"
         if (count := self.sent["observation_packets"]) > 1:
             text += f" in {count:,} packets ({self.delivery})"
+        if self.codec:
+            text += f", images as {self.codec}"
         if self.channel:
             text += f", {self.robots} robots share {self.channel}"
         on_link = self.sent.get("on_link_ms")
@@ -152,6 +156,8 @@ class EvalSetup:
             del told["robots"], told["channel"]
         elif is_path(f"{self.channel.schedule}"):
             told["schedule"] = hash_of(sources(Path(f"{self.channel.schedule}")))
+        if self.codec is None:
+            del told["codec"]
         return json.loads(json.dumps(told))  # type: ignore[no-any-return]
 
 
@@ -191,6 +197,7 @@ class Episode:
         """Return the name of the row: equal keys mean equal episodes."""
         if self.is_baseline:
             identity = {**identity, **BARE}
+            del identity["codec"]  # as without one: its images do not travel
         own = ""  # an executor of a package counts by its version
         if is_path(self.executor):
             file = Path(self.executor)

@@ -213,6 +213,10 @@ class Channel:
         self._robots = list[_Robot]()
         for n, (env, step) in enumerate(zip(self.envs, steps, strict=True)):
             own = read_options("Channel", cast("Options", each[n]))
+            if own["codec"] is not None:
+                raise InvalidValueError(
+                    "codec: on a channel, images travel as they are; leave it out"
+                )
             robot = _Robot(n, env, self._one(n, "link", link), seed, step.seconds, slot, own)
             self._robots.append(robot)
             warn_of(env, robot.loop, robot.links, step, own["chunk"])

@@ -29,7 +29,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from math import ceil, inf, nan
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -50,12 +50,17 @@ from cloudrc.link.profile import DirectionProfile
 from cloudrc.metrics.age import most_missed
 from cloudrc.outside.values import Quantity
 
+if TYPE_CHECKING:
+    from cloudrc.gym.codec import ObservationCodec
+
 EPISODES = 1 << 20
 """Number of episodes that belong to a seed of the environment."""
 AGES = 100
 """Ages of actions that are counted apart [ticks]."""
 ACKNOWLEDGED = 100
 """How many answers that reached the robot the policy is told of: the newest."""
+FIRST = -1
+"""Size of an observation that is that of the first of each episode."""
 NO_LINK = LinkProfile(DirectionProfile(), DirectionProfile())
 """Link before the first episode."""
 _NEWEST: WeakValueDictionary[tuple[int, str], RemoteLoop] = WeakValueDictionary()
@@ -76,7 +81,7 @@ class Settings:
     repeats: bool  # whether the robot repeats its last action if it has none, or executes `start`
     start: Any  # action before the first answer
     waits: bool  # whether the robot starts only when it has the first answer
-    observation_bytes: int
+    observation_bytes: int  # of a usual one, or FIRST
     action_bytes: int
     delivery: str  # one of DELIVERIES
     packet_bytes: int  # most bytes of a packet
@@ -105,6 +110,7 @@ class RemoteLoop:
         memory: What the policy remembers beside this observation.
         answers: When each answer of the episode was asked for, made and executed.
         judge_link: Function that warns of a link that nobody knew before, and says whether it did.
+        follows_first: Whether the first observation of an episode says what their usual size is.
     """
 
     def __init__(
@@ -117,14 +123,17 @@ class RemoteLoop:
         *,
         judge: Callable[[Any], None] | None = None,
         lane: type[Lane] = Lane,
+        codec: ObservationCodec | None = None,
     ) -> None:
         """Connect; `stream` is the name of the robot. Call `begin` for each episode.
 
-        `choose` returns the link of an episode. `lane` is the class of the uplink.
+        `choose` returns the link of an episode. `lane` is the class of the uplink. `codec` encodes
+        the images of observations; None: they travel as they are.
         `judge` raises an exception for a value of the executor that is no action.
         """
         self._settings, self._executor, self._judge = settings, executor, judge
-        self._lane = lane
+        self._lane, self._codec = lane, codec
+        self.follows_first = settings.observation_bytes == FIRST
         self.start, self.memory = settings.start, memory
         self._tick = -1  # before the first episode
         self.judge_link: Callable[[LinkProfile], bool] | None = None
@@ -155,7 +164,11 @@ class RemoteLoop:
         """
         self._episode = self._episode + 1 if seed is None else (int(seed) + 1) * EPISODES
         chosen = self._choose(self._episode if seed is None else seed, self._episode, self._stream)
-        if chosen is not self._chosen:
+        is_other, seen = chosen is not self._chosen, copied(observation)
+        if self._codec is not None:
+            seen, size = self._codec.begin(seen)
+            is_other |= self._use_size(size)
+        if is_other:
             self._chosen = chosen
             self._connect()
             if self.judge_link and self.judge_link(chosen.profile):
@@ -164,7 +177,7 @@ class RemoteLoop:
         self._down.begin(self._episode)
         self._tick = self._now_ns = self._seen_tick = self._number = 0
         _NEWEST[self._settings.seed, self._stream] = self
-        self.seen, self._committed = [copied(observation), info], Committed()
+        self.seen, self._committed = [seen, info], Committed()
         self.is_asked = True
         self._taken_ns = 0  # when its newest observation arrived
         self._begin_ns = self._free_ns = 0  # when the policy began its last answer, and has it
@@ -185,6 +198,18 @@ class RemoteLoop:
         if self._late is None:
             self._late = self._ticks_late((self._up.wire, self._down.wire))
         self._executor.begin(self._late, round(self._settings.dt * 1e9))
+
+    def _use_size(self, size: int) -> bool:
+        """Take the size [bytes] of the first observation as the usual one; say whether it changes.
+
+        It is rounded up, by 6 % at most: what is expected of each other size takes time to compute.
+        """
+        unit = 1 << max(0, size.bit_length() - 5)
+        size = -(-size // unit) * unit
+        if not self.follows_first or size == self._settings.observation_bytes:
+            return False
+        self._settings = replace(self._settings, observation_bytes=size)
+        return True
 
     def _meet_twin(self) -> None:
         """Say once if another robot is in the same episode of the same network, which draws."""
@@ -307,8 +332,13 @@ class RemoteLoop:
         self._receive(now_ns)
         if self._asks_always or self._executor.asks(tick, observation):
             committed = self._executor.committed(tick)
-            message = (tick, committed, copied(observation), dict(info))
             more = size_of(committed.actions) if committed.actions else 0
+            if self._codec is None:
+                sent = copied(observation)
+            else:
+                sent = self._codec.encode(observation)
+                more += sent.size - self._settings.observation_bytes
+            message = (tick, committed, sent, dict(info))
             self._up.send(tick, now_ns, message, more)
             self.answers.observed[tick] = now_ns
 
@@ -344,7 +374,9 @@ class RemoteLoop:
                 tick = message[0]
                 self.answers.arrived[tick] = self._taken_ns
                 if tick > self._seen_tick:
-                    self._seen_tick, self._committed, *self.seen = message
+                    each = (message,) if self._codec is None else self._codec.receive(message)
+                    for message in each:
+                        self._seen_tick, self._committed, *self.seen = message
             if begins and self._seen_tick > before:
                 self.is_asked = True
                 self._begin(self._seen_tick, begin_ns)
@@ -443,7 +475,9 @@ class RemoteLoop:
             late = float(np.mean(actions > deadline + 1e-9))
         is_new = np.array(self._fresh_ages) * dt <= (inf if deadline is None else deadline) + 1e-9
         rounded = np.ceil(np.array(self._action_ages) - 1e-9).clip(max=AGES - 1)
-        link = self._chosen.profile
+        link, sent = self._chosen.profile, {}
+        if self._codec is not None:
+            sent = self._codec.told(self._up.wire)
         start_ns = link.start_ns(self._settings.seed, self._episode, self._stream)
         met = Met(start_ns, round(ticks * dt * 1e9))
         if self._asked is None:
@@ -461,6 +495,6 @@ class RemoteLoop:
             "misses_in_10": most_missed(~is_new) if len(is_new) else nan,
             "held_share": self._held / ticks if ticks else nan,
             **self.answers.means(),
-            "uplink": self._up.summary(uplink.of(met)),
+            "uplink": {**self._up.summary(uplink.of(met)), **sent},
             "downlink": self._down.summary(downlink.of(met)),
         }

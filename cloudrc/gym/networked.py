@@ -76,6 +76,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             observation_bytes, action_bytes: Sizes on the wire [bytes]; None: those of the arrays.
             delivery: "datagrams": a lost packet loses its message; "stream": it makes it late.
             packet_bytes: Most bytes of a packet of a message.
+            codec: How images of the observation travel: "jpeg:70", "h264:800"; None: as they are.
             dt: Time of a step [s]; None: that of the environment.
             stream: Name of the robot, which with the seed selects its random numbers.
             observe_age: Whether the policy also observes the age of its observation [s].
@@ -100,6 +101,11 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.observation_space = self._loop.memory.space
         self.world_info: dict[str, Any] = {}
         warn_of(env, self._loop, links, self.step_time, chunk)
+
+    @property
+    def observation_bytes(self) -> int:
+        """Usual size of an observation on the wire [bytes]; with a codec, known after `reset`."""
+        return self._loop.uplink.wire.size
 
     @property
     def compute(self) -> Callable[[int], float]:

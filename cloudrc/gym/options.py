@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 from math import inf
 from pathlib import Path
-from typing import Any, TypedDict, cast
+from typing import TYPE_CHECKING, Any, TypedDict, cast
 
 import gymnasium
 from gymnasium.vector import VectorEnv
@@ -21,13 +21,17 @@ from cloudrc.gym.doubts import LinkWarning
 from cloudrc.gym.executors import Executor
 from cloudrc.gym.lane import DATAGRAMS, DELIVERIES, Lane, WaitingLane
 from cloudrc.gym.links import Links, choose_link
-from cloudrc.gym.loop import RemoteLoop, Settings
+from cloudrc.gym.loop import FIRST, RemoteLoop, Settings
 from cloudrc.gym.memory import Remembering
 from cloudrc.gym.step import FILM, WAY, StepTime, layers
 from cloudrc.gym.values import checker, copied, neutral, size_of
 from cloudrc.link.library import PACKET_BYTES, LinkProfile
 from cloudrc.outside.refusal import check_names, naming
-from cloudrc.outside.values import InvalidValueError, Quantity
+from cloudrc.outside.values import InvalidValueError, Quantity, shorten
+
+if TYPE_CHECKING:
+    from cloudrc.config.camera import CodecConfig
+    from cloudrc.gym.codec import ObservationCodec
 
 SIZE = Quantity("bytes", 0, 1_000_000_000, whole=True)
 """Size of a message."""
@@ -46,6 +50,8 @@ AGE = Quantity("s", 0.0)
 """Age of an action."""
 WAIT = 0.05
 """How long a robot waits in a step for an answer, as a share of the step."""
+CODECS = {"jpeg": "jpeg:70", "h264": "h264:800"}
+"""Codec of images -> an example with its number."""
 ANSWER = "answer"
 """Start of an episode: the robot waits for the first answer."""
 
@@ -64,6 +70,7 @@ class Options(TypedDict, total=False):
     action_bytes: int | None
     delivery: str
     packet_bytes: int
+    codec: str | None
     observe_age: bool
     observe_actions: int
     observe_step: bool
@@ -83,6 +90,7 @@ DEFAULTS: Options = {
     "action_bytes": None,
     "delivery": DATAGRAMS,
     "packet_bytes": PACKET_BYTES,
+    "codec": None,
     "observe_age": False,
     "observe_actions": 0,
     "observe_step": False,
@@ -106,10 +114,47 @@ def read_options(what: str, given: Options) -> Options:
         if read[name] is not None:
             with naming(name, f"None, or {wanted}"):
                 read[name] = quantity.of(read[name])
+    if read["codec"] is not None:
+        read_codec(read["codec"])
     if read["deadline"] is not None:
         with naming("deadline", "None, or the largest age of an action that is no miss"):
             read["deadline"] = AGE.of(read["deadline"])
     return cast(Options, read)
+
+
+def read_codec(text: str, place: str = "codec") -> CodecConfig:
+    """Read a codec of images, such as "jpeg", "jpeg:70" or "h264:800"; `place` names it."""
+    from cloudrc.config.camera import KBIT, QUALITY, CodecConfig  # of pydantic, which takes time
+
+    name, colon, number = str(text).partition(":")
+    numbers = {"jpeg": ("quality", QUALITY), "h264": ("kbit", KBIT)}
+    check_names("codec", [name], numbers, f"{place}: ")
+    key, quantity = numbers[name]
+    with naming(f"{place} {text}", f"{name} or {name}:{key.upper()}, such as {CODECS[name]}"):
+        return CodecConfig(codec=name, **({key: quantity.read(number)} if colon else {}))
+
+
+def _open_codec(
+    space: gymnasium.Space[Any], given: str | None, dt: float
+) -> ObservationCodec | None:
+    """Return what encodes observations of a space, one per `dt` [s] at most; None: nothing."""
+    if given is None:
+        return None
+    from cloudrc.gym.codec import ObservationCodec, shapes_of
+
+    codec, shapes = read_codec(given), [*shapes_of(space)]
+    with naming(f"codec {given}"):
+        if not shapes:
+            raise InvalidValueError(
+                f"there is no image to encode: no uint8 array of shape (height, width, 3) in "
+                f"{shorten(space)}; leave it out"
+            )
+        if codec.codec == "h264" and any(rows % 2 or columns % 2 for rows, columns, _ in shapes):
+            raise InvalidValueError(
+                f"an image has the shape {shapes[0]}, and H.264 needs even numbers of rows and "
+                "columns; choose jpeg"
+            )
+    return ObservationCodec(space, codec, dt)
 
 
 def connect(
@@ -131,6 +176,8 @@ def connect(
     observations, actions = spaces
     start, chunk = options["start"], options["chunk"]
     size, answer = options["observation_bytes"], options["action_bytes"]
+    if size is None:
+        size = FIRST if options["codec"] else size_of(observations.sample())
     waits = isinstance(start, str) and start == ANSWER
     if start is None or waits:
         start = neutral(actions)
@@ -145,7 +192,7 @@ def connect(
         repeats=options["hold"] == "repeat",
         start=copied(start),
         waits=waits,
-        observation_bytes=size_of(observations.sample()) if size is None else size,
+        observation_bytes=size,
         action_bytes=size_of(start) * (chunk or 1) if answer is None else answer,
         delivery=options["delivery"],
         packet_bytes=options["packet_bytes"],
@@ -159,7 +206,11 @@ def connect(
         own, is_ours = find_executor(options["executor"], actions, chunked=chunk is not None)
         memory, judge = Remembering(spaces, options, settings.start), None if is_ours else check
         lane = Lane if slot is None else WaitingLane
-        loops.append(RemoteLoop(settings, choose, own, memory, stream, judge=judge, lane=lane))
+        codec = _open_codec(observations, options["codec"], dt)
+        loop = RemoteLoop(
+            settings, choose, own, memory, stream, judge=judge, lane=lane, codec=codec
+        )
+        loops.append(loop)
     return loops, known
 
 
@@ -190,8 +241,10 @@ def warn_of(
     """
     limits = [each.spec.max_episode_steps for each in layers(env) if each.spec]
     longest = min(filter(None, limits), default=inf)
-    texts = [text for link in links for text in loop.doubts(link, count or 1, longest)]
-    if not links:  # a function chooses them
+    texts = list[str]()
+    if not loop.follows_first:
+        texts = [text for link in links for text in loop.doubts(link, count or 1, longest)]
+    if not links or loop.follows_first:  # a function chooses them, or the size is not known yet
         loop.judge_link = partial(_warn_of_link, loop, count or 1, longest)
     if FILM in step.source:
         texts.append(f"a step takes {step}; if it takes another time, {WAY}")
