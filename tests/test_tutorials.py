@@ -10,7 +10,7 @@ from tests.tutorials import Reader
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("name", ["policy", *nightly("fly-and-steer")])
+@pytest.mark.parametrize("name", ["policy", *nightly("fly-and-steer", "see")])
 def test_a_tutorial_works(name, tmp_path):
     reader = Reader(tmp_path, "a session")
     try:
@@ -22,4 +22,4 @@ def test_a_tutorial_works(name, tmp_path):
 def test_every_tutorial_is_played():
     """tests/link/exec and tests/e2e play the last two."""
     names = {path.stem for path in DOCS.glob("tutorials/*.md")}
-    assert names == {"policy", "fly-and-steer", "two-programs", "cluster"}
+    assert names == {"policy", "see", "fly-and-steer", "two-programs", "cluster"}
