@@ -66,7 +66,7 @@ class H264Encoder:
     """Encodes pictures with x264, without a delay; all but the key frames need the one before."""
 
     def __init__(self, codec: CodecConfig, width: int, height: int, rate_hz: float) -> None:
-        """Set bit rate and key frames of `codec`, and size and rate of the pictures."""
+        """Set bit rate and key frames of `codec`, size [pixels] and `rate_hz` of pictures [Hz]."""
         self._av, rate = _av(), f"{codec.kbit}k"
         self._context = made = self._av.CodecContext.create("libx264", "w")
         made.width, made.height, made.pix_fmt = width, height, "yuv420p"
@@ -109,7 +109,7 @@ class H264Decoder:
 
 
 def make_encoder(codec: CodecConfig, width: int, height: int, rate_hz: float) -> Encoder:
-    """Make the encoder of a session, whose pictures have one size and come at a rate.
+    """Make the encoder of a session, with pictures of one size [pixels] at `rate_hz` [Hz].
 
     Raises:
         MissingPrerequisiteError: If its package is not installed.

@@ -71,6 +71,8 @@ class _Robot:
     ) -> None:
         """Connect a robot whose step takes `dt` [s]; `slot` is that of its channel [s], if any."""
         self.number, self.env, self.dt = number, env, dt
+        if options["codec"] is not None:
+            raise InvalidValueError("codec: on a channel, images travel as they are; leave it out")
         spaces, chunk = (env.observation_space, env.action_space), options["chunk"]
         names = (f"robot{number}",)
         (self.loop,), self.links = connect(spaces, dt, link, seed, names, options, slot=slot)
@@ -213,10 +215,6 @@ class Channel:
         self._robots = list[_Robot]()
         for n, (env, step) in enumerate(zip(self.envs, steps, strict=True)):
             own = read_options("Channel", cast("Options", each[n]))
-            if own["codec"] is not None:
-                raise InvalidValueError(
-                    "codec: on a channel, images travel as they are; leave it out"
-                )
             robot = _Robot(n, env, self._one(n, "link", link), seed, step.seconds, slot, own)
             self._robots.append(robot)
             warn_of(env, robot.loop, robot.links, step, own["chunk"])

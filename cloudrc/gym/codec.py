@@ -52,8 +52,9 @@ def shapes_of(space: spaces.Space[Any]) -> Iterator[tuple[int, ...]]:
 
 
 def _is_image(space: spaces.Space[Any]) -> bool:
-    is_bytes = isinstance(space, spaces.Box) and space.dtype == np.uint8
-    return is_bytes and len(space.shape) == 3 and space.shape[2] == 3
+    if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
+        return False
+    return len(space.shape) == 3 and space.shape[2] == 3
 
 
 def _change(space: spaces.Space[Any], value: Any, change: Callable[[Any], Any]) -> Any:
@@ -70,7 +71,7 @@ class ObservationCodec:
     """Encodes and decodes the observations of an episode."""
 
     def __init__(self, space: spaces.Space[Any], codec: CodecConfig, dt: float) -> None:
-        """Set the space of an observation, and the time of a step [s].
+        """Set the space of an observation; `dt` is the time of a step [s].
 
         Raises:
             MissingPrerequisiteError: If the package of the codec is not installed.

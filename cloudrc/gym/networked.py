@@ -94,12 +94,11 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         gymnasium.Wrapper.__init__(self, env)
         self.step_time, chunk = find_step(env, dt), options["chunk"]
         self.dt = self.step_time.seconds
-        spaces = env.observation_space, env.action_space
+        spaces, self.world_info = (env.observation_space, env.action_space), dict[str, Any]()
         (self._loop,), links = connect(spaces, self.dt, link, seed, (stream,), options)
         self.action_space, self._split = answer_space(env.action_space, chunk)
         self._check = checker(self.action_space, describe_answer(chunk))
         self.observation_space = self._loop.memory.space
-        self.world_info: dict[str, Any] = {}
         warn_of(env, self._loop, links, self.step_time, chunk)
 
     @property

@@ -131,7 +131,7 @@ def read_codec(text: str, place: str = "codec") -> CodecConfig:
     check_names("codec", [name], numbers, f"{place}: ")
     key, quantity = numbers[name]
     with naming(f"{place} {text}", f"{name} or {name}:{key.upper()}, such as {CODECS[name]}"):
-        return CodecConfig(codec=name, **({key: quantity.read(number)} if colon else {}))
+        return CodecConfig(codec=cast(Any, name), **({key: quantity.read(number)} if colon else {}))
 
 
 def _open_codec(
@@ -157,6 +157,18 @@ def _open_codec(
     return ObservationCodec(space, codec, dt)
 
 
+def _usual_size(space: gymnasium.Space[Any], options: Options) -> int:
+    size = options["observation_bytes"]
+    if size is None:
+        return FIRST if options["codec"] else size_of(space.sample())
+    return size
+
+
+def _usual_answer(action: Any, options: Options) -> int:
+    size = options["action_bytes"]
+    return size_of(action) * (options["chunk"] or 1) if size is None else size
+
+
 def connect(
     spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]],
     dt: float,
@@ -175,9 +187,6 @@ def connect(
     """
     observations, actions = spaces
     start, chunk = options["start"], options["chunk"]
-    size, answer = options["observation_bytes"], options["action_bytes"]
-    if size is None:
-        size = FIRST if options["codec"] else size_of(observations.sample())
     waits = isinstance(start, str) and start == ANSWER
     if start is None or waits:
         start = neutral(actions)
@@ -192,8 +201,8 @@ def connect(
         repeats=options["hold"] == "repeat",
         start=copied(start),
         waits=waits,
-        observation_bytes=size,
-        action_bytes=size_of(start) * (chunk or 1) if answer is None else answer,
+        observation_bytes=_usual_size(observations, options),
+        action_bytes=_usual_answer(start, options),
         delivery=options["delivery"],
         packet_bytes=options["packet_bytes"],
         answers_each_tick=options["answers"] == "step",
@@ -205,12 +214,9 @@ def connect(
     for stream in streams:
         own, is_ours = find_executor(options["executor"], actions, chunked=chunk is not None)
         memory, judge = Remembering(spaces, options, settings.start), None if is_ours else check
-        lane = Lane if slot is None else WaitingLane
-        codec = _open_codec(observations, options["codec"], dt)
-        loop = RemoteLoop(
-            settings, choose, own, memory, stream, judge=judge, lane=lane, codec=codec
-        )
-        loops.append(loop)
+        more: Any = {"judge": judge, "lane": Lane if slot is None else WaitingLane}
+        more["codec"] = _open_codec(observations, options["codec"], dt)
+        loops.append(RemoteLoop(settings, choose, own, memory, stream, **more))
     return loops, known
 
 
