@@ -92,9 +92,12 @@ def sign_test(less: int, more: int) -> float:
     return min(1.0, 2 * tail(min(less, more), less + more))
 
 
-def tail(few: int, n: int) -> float:
-    """Return the probability of at most `few` of `n` events that have a probability of 1/2 each."""
-    return float(sum(_choices(n, few + 1)) / 2**n)
+def tail(few: int, n: int, chance: float = 0.5) -> float:
+    """Return the probability of at most `few` of `n` events, each with probability `chance` [1]."""
+    part, whole = chance.as_integer_ratio()  # the sum is exact
+    ways = enumerate(_choices(n, few + 1))
+    found = sum(each * part**k * (whole - part) ** (n - k) for k, each in ways)
+    return float(found / whole**n)
 
 
 def holm(ps: Sequence[float]) -> list[float]:

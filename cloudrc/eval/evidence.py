@@ -99,20 +99,20 @@ def _means(numbers: Sequence[Mapping[str, float]]) -> Iterator[tuple[str, float]
                 yield f"{name}_of", sum(weights)
 
 
-def survivals(groups: Groups) -> list[dict[str, Any]]:
+def survivals(groups: Groups, share: float = 0.5) -> list[dict[str, Any]]:
     """Find for each executor up to which round trip the policy survives, also in words.
 
     From the smallest round trip on, an exact test asks of the seeds with a success without a
-    network whether more than half have a success over the network. The first round trip at which
-    this is not shown ends the sequence, so that its round trips need no adjustment. Each of k
-    executors has the level .05 / k (Bonferroni): the probability that any claim is wrong is at most
-    5 %.
+    network whether more than this `share` [1] has a success over the network. The first round trip
+    at which this is not shown ends the sequence, so that its round trips need no adjustment. Each
+    of k executors has the level .05 / k (Bonferroni): the probability that any claim is wrong is at
+    most 5 %.
 
     Source: A. C. Tamhane, C. W. Dunnett, J. W. Green, J. D. Wetherington, "Multiple test procedures
     for identifying the maximum safe dose", 2001.
     """
     base, found = _seeds(groups[BASELINE][None]), list[dict[str, Any]]()
-    least = least_kept(len(base), len(groups) - 1)
+    least = least_kept(len(base), len(groups) - 1, share)
     for executor, conditions in groups.items():
         each: dict[str, Any] = {"executor": executor, "of": len(base)}
         text = f"{executor} is not shown to survive a round trip that was asked"
@@ -120,7 +120,8 @@ def survivals(groups: Groups) -> list[dict[str, Any]]:
             text += f": {len(base)} successes without a network are too few to show it"
         for rtt, rows in conditions.items():
             kept = len(base & _seeds(rows))
-            each |= {"tried_ms": rtt, "kept": kept, "p": tail(len(base) - kept, len(base))}
+            p = tail(len(base) - kept, len(base), 1.0 - share)
+            each |= {"tried_ms": rtt, "kept": kept, "p": p}
             if least is None or kept < least:
                 text += f"; at {place(rtt)} it keeps {kept} of {len(base)} successes"
                 break
@@ -130,13 +131,14 @@ def survivals(groups: Groups) -> list[dict[str, Any]]:
     return found[1:]
 
 
-def least_kept(count: int, executors: int) -> int | None:
-    """Return how many of `count` successes show that more than half are kept; None: all too few.
+def least_kept(count: int, executors: int, share: float = 0.5) -> int | None:
+    """Return how many of `count` successes show that more than `share` [1] is kept; None: too few.
 
     Each of the `executors` has an equal part of the 5 % at which a claim may be wrong.
     """
     level = LEVEL / max(1, executors)
-    return next((n for n in range(count + 1) if tail(count - n, count) < level), None)
+    numbers = range(count + 1)
+    return next((n for n in numbers if tail(count - n, count, 1.0 - share) < level), None)
 
 
 def explain_survival(count: int, executors: int) -> str:
