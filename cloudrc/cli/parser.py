@@ -50,6 +50,7 @@ GROUPS: dict[str, dict[str, str]] = {
     },
     "policies": {
         "eval": "measure whether a policy survives a network",
+        "rank": "rank policies over networks, with tasks and links that are fixed",
         "policy": "serve a policy that controls robots elsewhere",
     },
     "cluster (a flight in real time here starts the last four, too)": {

@@ -22,9 +22,11 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "mpc": ("daqp",),
     "bucket": ("s3fs",),
     "camera": ("av",),
+    "rank": ("foundation_policy",),
+    "arms": ("metaworld",),
 }
 """Name of an extra in pyproject.toml -> the modules that it installs."""
-PACKAGES = {"foxglove": "foxglove-sdk"}
+PACKAGES = {"foxglove": "foxglove-sdk", "foundation_policy": "foundation-policy"}
 """Module -> its package, where the names differ."""
 MODES: dict[str, tuple[str, ...]] = {
     "local": ("world", "record", "report", "api"),
