@@ -39,7 +39,7 @@ from cloudrc.exposition.table import METRICS, ROLES
 from cloudrc.metrics.definitions import QUANTITIES, RecordQuantity
 from cloudrc.outside.values import to_plain
 from cloudrc.record.topics import TOPICS
-from tools import faults, metadata
+from tools import faults, metadata, ranking
 from tools.chart_values import added, earliest, make_schema, table_rows
 from tools.dashboards import UNITS
 from tools.guests import OWN_FLIGHTS, link, pages
@@ -152,6 +152,7 @@ def outputs() -> dict[Path, str]:
         **insert(ROOT / "docs" / "on-call.md", f"\n{_alerts()}"),
         **insert(ROOT / "docs" / "reference" / "faults.md", _faults()),
         **pages(),
+        **ranking.outputs(),
         **insert(CHART / "README.md", f"\n{rows}"),
         **insert(ROOT / "mkdocs.yml", f"{_navigation()}# "),
         **insert(CHART / "files" / "dashboards" / "missions.yaml", f"{panels(QUANTITIES)}# "),

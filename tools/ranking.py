@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Write the tables of ranked policies, and their page, from the entries in docs/rank."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from cloudrc.rank.entry import read_entry
+from cloudrc.rank.page import make_page
+from cloudrc.rank.score import in_order
+from tools.markdown import table
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "docs" / "rank"
+MARKS = re.compile(r"(<!-- ranked: (.*) -->\n).*?(<!-- end of ranking -->)", re.DOTALL)
+"""Around a generated table; the first mark names its tasks."""
+PAGES = ("ranking.md", "results.md")
+
+
+def outputs() -> dict[Path, str]:
+    """Generate the page of the ranking, and the tables of pages: file -> text."""
+    files = sorted(FOLDER.glob("*.json"))
+    made = {FOLDER / "index.html": make_page(FOLDER / "index.html", files)}
+    for name in PAGES:
+        page = ROOT / "docs" / name
+        made[page] = MARKS.sub(
+            lambda found: f"{found[1]}{rows(found[2].split(), files)}{found[3]}",
+            page.read_text("utf-8"),
+        )
+    return made
+
+
+def rows(tasks: Sequence[str], files: Sequence[Path]) -> str:
+    """Return the table of the entries for some tasks."""
+    entries = [read_entry(each) for each in files]
+    lines = list[tuple[str, ...]]()
+    for task in tasks:
+        for _, entry in in_order(each for each in entries if each["task"] == task):
+            done = {
+                each["rtt_ms"]: each["success"].count("1")
+                for each in entry["results"]
+                if each["rtt_ms"] is not None
+            }
+            some = (f"{done[rtt]}/50" for rtt in (0, 10, 50, 100, 200, 600))
+            name = f"`{entry['policy']}`, {entry['executor']}"
+            lines.append((f"`{task}`", name, entry["score"], f"{entry['area']:.2f}", *some))
+    return table(
+        "task | policy | score | area | 0 ms | 10 ms | 50 ms | 100 ms | 200 ms | 600 ms", lines
+    )
