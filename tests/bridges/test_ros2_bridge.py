@@ -21,10 +21,12 @@ from cloudrc.drivers.readers import RecordReader, RecordSender
 from cloudrc.geometry.scene import Scene
 from cloudrc.geometry.shapes import Shapes
 from cloudrc.messages import ZERO
+from cloudrc.pictures import Jpeg
 from cloudrc.records import Lateness
 from cloudrc.report.markers import encode_markers, scene_shapes
 from tests.bridges.conftest import needs_ros
 from tests.console.conftest import FakeApi, control, start
+from tests.support.camera import needs_renderer
 from tests.support.told import told
 
 pytestmark = needs_ros
@@ -283,6 +285,21 @@ def test_scans_reach_a_node_in_the_frame_of_the_scanner(tmp_path, monkeypatch):
         first, second = watcher.got["scan"][-2:]
         period = second.header.stamp.nanosec - first.header.stamp.nanosec
         assert period * 1e-9 % 1.0 == pytest.approx(0.1, abs=0.03)
+
+
+@needs_renderer
+def test_pictures_reach_a_node_in_the_frame_of_the_camera(tmp_path, monkeypatch):
+    from sensor_msgs.msg import CompressedImage
+
+    watcher = Watcher(camera=("/camera/compressed", CompressedImage))
+    with closing(watcher), session(tmp_path, monkeypatch, "follow"):
+        watcher.wait(lambda: len(watcher.got["camera"]) > 10, 60.0)
+        first, second = watcher.got["camera"][-2:]
+        assert (second.header.frame_id, second.format) == ("camera", "jpeg")
+        assert abs(time.time() - second.header.stamp.sec) < 5.0
+        assert Jpeg().decode(bytes(second.data)).shape == (240, 320, 3)
+        period = (second.header.stamp.nanosec - first.header.stamp.nanosec) * 1e-9 % 1.0
+        assert 0.06 < period < 0.5, "some may be late"
 
 
 @pytest.mark.skipif(not which("g++"), reason="needs g++")
