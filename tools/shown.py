@@ -150,9 +150,9 @@ SHOWN = (
         " cloudrc timeline runs/latest",
         10.0,
         (
-            "uplink of the scan mean 33.16 p99 81.40 ms",
+            "uplink of the scan or picture mean 33.16 p99 81.40 ms",
             "perception computes mean 60.00 p99 60.00 ms",
-            "age of a scan when the robot acts on it mean 120.95 p99 177.68 ms",
+            "age of a scan or picture when acted on mean 120.95 p99 177.68 ms",
         ),
     ),
     Shown(

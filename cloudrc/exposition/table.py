@@ -213,7 +213,8 @@ _TABLE = (
                "Pictures that were not taken, because the one before was still being rendered.",
                counted="frames_late"),
     LiveMetric((WORLD,), HISTOGRAM, "cloudrc_camera_seconds",
-               "Time that rendering and encoding a picture took.", buckets=FRAME_BUCKETS),
+               "Time that rendering and encoding a picture took; absent without a camera.",
+               buckets=FRAME_BUCKETS),
     *_of_quantities(WORLD),
     LiveMetric((CLOUD,), HISTOGRAM, "cloudrc_uplink_delay_seconds",
                "One-way delay from world to cloud, late datagrams included; absent unless both "

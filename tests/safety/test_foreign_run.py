@@ -106,7 +106,7 @@ def modules_with(text):
 
 def test_plug_ins_and_processes_begin_only_where_they_should():
     """All code that does not fly uses `read_experiment`, which imports no plug-in."""
-    flies = {"runs/experiment.py", "processes/ends.py", "runs/bench.py"}
+    flies = {"runs/experiment.py", "processes/ends.py", "runs/bench.py", "reproduce/flights.py"}
     flies |= {"exercise/checks.py"}
     flies |= {"cluster/survey.py"}  # values with a plug-in by name; files are not looked at
     assert modules_with("load_experiment(") == flies | {"config/load.py"}
