@@ -42,7 +42,7 @@ def _seal(entry: Mapping[str, Any]) -> str:
 
 
 def read_entry(path: Path) -> dict[str, Any]:
-    """Read an entry of this version; raise a BadInputError that says why it is none."""
+    """Read an entry of this version; raise an error that says why it is none."""
     entry = read_json(path)
     with naming(str(path)), reading(path, "is no entry of 'cloudrc rank'"):
         _check(entry)

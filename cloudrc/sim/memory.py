@@ -79,7 +79,7 @@ def boxes_around(model: Any, data: Any) -> tuple[Any, float]:
 
 
 def mujoco_library() -> ctypes.CDLL:
-    """Return MuJoCo's own library, which `import mujoco` has loaded."""
+    """Return MuJoCo's own library, which the engine has loaded."""
     folder = Path(mujoco.__file__).parent
     files = [*folder.glob("libmujoco.so*"), *folder.glob("libmujoco*.dylib")]
     if len(files) != 1:
