@@ -16,7 +16,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from cloudrc.config.load import read_experiment
+from cloudrc.config.load import read_attached, read_experiment
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.drivers.local import JOURNAL_FILE, under_way
 from cloudrc.errors import StateError
@@ -83,6 +83,16 @@ def open_recording(run: Path) -> tuple[Path, Recording]:
     check_ended(file.parent)
     check_there(file, "name the folder of a run, or a file")
     return file, Recording.read(file, whole=True)
+
+
+def read_flown(run: Path) -> tuple[Recording, ResolvedExperiment]:
+    """Read recording and experiment of a run that has ended: its folder or its MCAP file."""
+    if run.is_dir():
+        check_ended(run)
+        recording, experiment, _ = read_run(run)
+        return recording, experiment
+    _, recording = open_recording(run)
+    return recording, read_attached(recording.attachments, str(run))
 
 
 def robots_in(folder: Path) -> list[Path]:

@@ -6,10 +6,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cloudrc.config.load import read_attached
 from cloudrc.files import write_atomically
 from cloudrc.report.flown import flight_of
-from cloudrc.report.folder import check_ended, open_recording, read_run
+from cloudrc.report.folder import read_flown
 from cloudrc.report.replay import write_page
 
 
@@ -18,12 +17,7 @@ def write_replay(run: Path, out: Path | None = None) -> Path:
 
     By default the page is replay.html beside the recording, and replaces an earlier one.
     """
-    if run.is_dir():
-        check_ended(run)
-        recording, experiment, _ = read_run(run)
-    else:
-        _, recording = open_recording(run)
-        experiment = read_attached(recording.attachments, str(run))
+    recording, experiment = read_flown(run)
     page = write_page(flight_of(recording, experiment), experiment)
     path = out or (run if run.is_dir() else run.parent) / "replay.html"
     write_atomically(path, page.encode())

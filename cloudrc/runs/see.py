@@ -18,7 +18,6 @@ from cloudrc import plugins
 from cloudrc.cloud.perceiving import judge
 from cloudrc.cloud.perceptions import Frame, Perception, Scan, Seen
 from cloudrc.config.choice import PlugIn
-from cloudrc.config.load import read_attached
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import facts, known_robot
@@ -32,7 +31,7 @@ from cloudrc.outside.values import InvalidValueError
 from cloudrc.pictures import Jpeg
 from cloudrc.record.columns import Recording
 from cloudrc.report.flown import flight_of
-from cloudrc.report.folder import check_ended, open_recording, read_run
+from cloudrc.report.folder import read_flown
 
 
 class SecondLook(NamedTuple):
@@ -59,12 +58,7 @@ def look_again(run: Path, name: str | None) -> list[SecondLook]:
     Raises:
         InvalidValueError: If the run has nothing to look at, or no perception.
     """
-    if run.is_dir():
-        check_ended(run)
-        recording, experiment, _ = read_run(run)
-    else:
-        _, recording = open_recording(run)
-        experiment = read_attached(recording.attachments, str(run))
+    recording, experiment = read_flown(run)
     perception = _build(experiment, name)
     return [*_look(recording, experiment, perception)]
 
