@@ -25,7 +25,7 @@ from tools.results import cloudrc
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "results.md"
 TOOL, RELEASE = "tools.limits", "limits"
-CPUS = "250m", "500m", "1", "2"
+CPUS = "100m", "150m", "200m", "250m"
 """Limits of world's container [cores]."""
 RATES = 5, 10, 15
 """Pictures per second [Hz]."""
