@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import cloudrc
+from tests.support import contrast
 from tools.fly_here.flights import EXPERIMENT, RATE_HZ, RECIPES, SEED, Recipe, document, fly, hull
 from tools.fly_here.page import BYTES_MAX, write
 
@@ -142,29 +143,15 @@ def pixels(shown):
     )
 
 
-CONTRAST = """() => {
-  const parse = (text) => text.match(/[\\d.]+/g).map(Number);
-  const light = (rgb) => rgb.slice(0, 3).map((part) => part / 255)
-    .map((part) => part <= 0.04045 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4)
-    .reduce((sum, part, which) => sum + part * [0.2126, 0.7152, 0.0722][which], 0);
-  const ground = (element) => {
-    const found = parse(getComputedStyle(element).backgroundColor);
-    return found[3] === 0 && element.parentElement ? ground(element.parentElement) : found; };
-  const ratio = (one, other) => (Math.max(one, other) + 0.05) / (Math.min(one, other) + 0.05);
+INKS = f"""() => {{ {contrast.FUNCTIONS}
   const poor = [], style = getComputedStyle(document.documentElement);
   const named = (name) => light([1, 3, 5].map((at) =>
-    parseInt(style.getPropertyValue(`--${name}`).trim().slice(at, at + 2), 16)));
+    parseInt(style.getPropertyValue(`--${{name}}`).trim().slice(at, at + 2), 16)));
   for (const name of ['young', 'old', 'hold', 'ghost', 'fails', 'ink'])
     for (const behind of ['paper', 'wall'])
-      if (ratio(named(name), named(behind)) < 3) poor.push(`${name} on ${behind}`);
-  for (const element of document.querySelectorAll('body *')) {
-    const has_text = [...element.childNodes].some((one) => one.nodeType === 3 && one.data.trim());
-    if (!has_text || !element.getClientRects().length) continue;
-    const both = [parse(getComputedStyle(element).color), ground(element)].map(light);
-    if (ratio(...both) < 4.5) poor.push(`${element.outerHTML.slice(0, 60)} ${ratio(...both)}`);
-  }
-  return poor; }"""
-"""What has less contrast than WCAG 2.2 asks for, level AA: texts (1.4.3) and drawings (1.4.11)."""
+      if (ratio(named(name), named(behind)) < 3) poor.push(`${{name}} on ${{behind}}`);
+  return poor; }}"""
+"""Returns the colours of the drawings below the 3 of WCAG 2.2, 1.4.11."""
 
 
 @pytest.mark.process
@@ -173,4 +160,5 @@ CONTRAST = """() => {
 def test_texts_and_drawings_have_the_contrast_of_wcag_aa(browse, page, scheme):
     shown = opened(browse, page.as_uri(), scheme=scheme)
     shown.locator("summary").click()
-    assert shown.evaluate(CONTRAST) == []
+    assert shown.evaluate(contrast.TEXTS) == []
+    assert shown.evaluate(INKS) == []

@@ -13,6 +13,7 @@ from cloudrc.rank import entry as entries
 from cloudrc.rank import play, tasks
 from cloudrc.rank.page import write_page
 from cloudrc.rank.score import in_order, score
+from tests.support import contrast
 
 FULL = "1" * 50
 
@@ -145,17 +146,26 @@ def test_a_policy_that_answers_nan_is_a_row_and_not_dropped(call, short, tmp_pat
 
 
 @pytest.fixture
-def real(tmp_path):
+def write(tmp_path):
+    """Return a function that writes an entry with some results, and returns its path."""
+
+    def write(policy, made):
+        content = {
+            **{"schemaVersion": 1, "rank": "1", "task": "linear", "policy": policy},
+            **{"executor": "newest", **score(made), "failed": "", "answer": "below 1 ms"},
+            **{"hashes": tasks.pinned("linear"), "results": made, "code": "0123"},
+            **{"versions": {"cloudrc": "1"}, "command": "cloudrc rank", "date": "2026-11-30"},
+        }
+        entries.write_entry(path := tmp_path / f"{policy}.json", content)
+        return path
+
+    return write
+
+
+@pytest.fixture
+def real(write):
     """Return the path of an entry with all seeds."""
-    made = results(*[FULL] * 3)
-    content = {
-        **{"schemaVersion": 1, "rank": "1", "task": "linear", "policy": "linear"},
-        **{"executor": "newest", **score(made), "failed": "", "answer": "below 1 ms"},
-        **{"hashes": tasks.pinned("linear"), "results": made, "code": "0123"},
-        **{"versions": {"cloudrc": "1"}, "command": "cloudrc rank", "date": "2026-11-30"},
-    }
-    entries.write_entry(path := tmp_path / "entry.json", content)
-    return path
+    return write("entry", results(*[FULL] * 3))
 
 
 def edit(content):
@@ -194,3 +204,35 @@ def test_what_is_not_installed_is_named_with_its_extra(call, monkeypatch):
     said = call("rank --task reach-v3", code=3).err
     assert "metaworld (not installed)" in said
     assert "cloudrc[arms]" in said
+
+
+@pytest.mark.process
+def test_the_page_sorts_by_every_column_and_can_be_read(write, browse, tmp_path):
+    made = {
+        "far": results(*[FULL] * 5),
+        "near": results(*[FULL] * 3),
+        "none": results(lost(9), *[lost(1)] * 9),
+        **{f"other {n}": results(lost(n)) for n in range(2, 6)},  # more than there are colours
+    }
+    write_page(tmp_path / "page.html", [write(*each) for each in made.items()])
+    page = browse((tmp_path / "page.html").as_uri())
+
+    def order(head, clicks):
+        for _ in range(clicks):
+            page.locator("th button", has_text=head).click()
+        cells = page.locator("tbody tr td:nth-child(2)").all_inner_texts()
+        return [each.strip() for each in cells]
+
+    by_place = order("place", 0)
+    assert by_place[:2] == ["far", "near"]
+    assert order("policy", 1) == sorted(made)
+    assert order("policy", 1) == sorted(made, reverse=True)
+    assert order("score", 2)[:2] == ["far", "near"], "none and - come last"
+    assert order("area", 2)[0] == "none", "it wins the most"
+    page.locator("tbody a", has_text="near").click()
+    assert page.url.endswith("near.json")
+    page.go_back()
+    assert page.evaluate(contrast.TEXTS) == []
+    assert page.evaluate(contrast.LINES, "polyline, td path") == []
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
