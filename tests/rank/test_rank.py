@@ -120,6 +120,15 @@ def test_the_margin_of_the_linear_plant_is_that_of_its_roots(policy, words, shor
     assert score(whole)["score"] == words
 
 
+def test_the_predictor_of_the_linear_plant_answers_numbers_over_a_delay_that_varies(
+    short, tmp_path
+):
+    short(27, (("5g-sa", None),))
+    played = play.Played(tasks.Entrant("linear", "smith", "newest"), tmp_path / "entry.json")
+    played.trials["5g-sa", None] = played.trials["5g-sa", None][-1:]
+    assert played.play(1, None, lambda done: None) is None
+
+
 def test_a_repetition_gives_the_same_file_and_shards_give_it_too(call, short, tmp_path):
     short(2, FEW)
     files = [tmp_path / name / "one.json" for name in ("a", "b")]

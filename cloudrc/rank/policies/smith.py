@@ -11,6 +11,9 @@ from __future__ import annotations
 from typing import Any
 
 POLE, GAIN = 1.05, 0.12
+ACTION_MAX = 100.0
+"""Largest action [1]. Over a delay that varies the policy may find a wrong one, and its answers would
+grow without a bound. A constant delay of 600 ms needs less."""
 
 
 class Smith:
@@ -33,8 +36,9 @@ class Smith:
         self._before = state
         for action in self._sent[len(self._sent) - self._delay :]:
             state = POLE * state + action
-        self._sent.append(-GAIN * state)
-        return {"actions": [[-GAIN * state]]}
+        action = max(-ACTION_MAX, min(ACTION_MAX, -GAIN * state))
+        self._sent.append(action)
+        return {"actions": [[action]]}
 
 
 build = Smith
