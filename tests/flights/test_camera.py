@@ -22,6 +22,7 @@ from cloudrc.record.writer import McapWriter
 from cloudrc.runs.flight import fly_in_memory
 from cloudrc.tunnel.end import Identity
 from tests.flights.conftest import ring
+from tests.support.camera import needs_renderer
 from tests.support.commands import python
 
 SHORT = "mission.waypoints=[{position_m: [0, 0, 1], dwell_s: 4, tolerance_m: 1}]"
@@ -149,6 +150,23 @@ def test_a_flight_repeats_to_the_bit_also_with_encrypted_bytes():
     run = VirtualRun(world, cloud, *build_links(experiment))
     run.fly(lambda: teleop.over, 60_000_000_000, store.add)
     assert Recording(records=store).sha256 == first.sha256
+
+
+@needs_renderer
+@pytest.mark.parametrize("codec", ["jpeg", "h264"])
+def test_a_flight_with_the_real_renderer_repeats_to_the_bit(codec, monkeypatch):
+    if codec == "h264":
+        pytest.importorskip("av", reason="PyAV comes with the extra camera")
+    monkeypatch.undo()  # the fixture `clock`
+    settings = (f"camera.codec={codec}", "mission.follow.duration_s=2")
+    experiment = load_experiment("follow", settings)
+    first, second = (fly_in_memory(experiment) for _ in range(2))
+    kept, again = ([*each.flight.recording["/camera"]["data"]] for each in (first, second))
+    assert kept == again
+    assert len({*kept}) > 25, "the board moves: two seconds of different pictures"
+    assert second.records_sha256 == first.records_sha256
+    assert second.verdict == first.verdict
+    assert second.numbers == first.numbers
 
 
 def test_the_rest_of_a_flight_keeps_every_bit():
