@@ -2,12 +2,13 @@
 
 """Robots of a fleet act on each other through the cell and the shared cloud alone."""
 
+import numpy as np
 import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.processes.ends import EndSettings, open_end
-from cloudrc.record.columns import Recording, RecordStore
+from cloudrc.record.columns import Recording, RecordStore, datagrams
 from cloudrc.runs.experiment import check_mode, robots_of
 from cloudrc.runs.fleet import assemble_fleet
 from cloudrc.runs.flight import fly_in_memory
@@ -24,13 +25,18 @@ def alone(*settings):
     return fly_in_memory(load_experiment("steps", (*SHORT, *settings))).records_sha256
 
 
-def in_fleet(*settings):
-    """Fly a fleet; return the hash of each robot's records."""
-    experiment = load_experiment("steps", (*SHORT, *settings))
-    robots = robots_of(experiment, "steps", (*SHORT, *settings))
+def fly_fleet(name, *settings):
+    """Fly a fleet with a shipped experiment; return the recording of each robot."""
+    experiment = load_experiment(name, settings)
+    robots = robots_of(experiment, name, settings)
     stores = [RecordStore() for _ in robots]
     assemble_fleet(experiment, robots, [store.add for store in stores]).fly()
-    return [Recording(records=store).sha256 for store in stores]
+    return [Recording(records=store) for store in stores]
+
+
+def in_fleet(*settings):
+    """Fly a fleet; return the hash of each robot's records."""
+    return [flown.sha256 for flown in fly_fleet("steps", *SHORT, *settings)]
 
 
 @pytest.mark.parametrize("own", [(), (VARIED,), ("fleet.phase=equal", CLOCK)])
@@ -96,6 +102,22 @@ def test_a_fleet_with_contention_flies_twice_alike(queue, sharing):
     flown = in_fleet(*fleet)
     assert flown == in_fleet(*fleet)
     assert len({*flown}) == 4
+
+
+def test_each_rover_of_a_fleet_drives_by_its_own_scans_through_the_cell():
+    goal = (2.0, 0.0)
+    way = f"mission.waypoints=[{{position_m: {[*goal]}, tolerance_m: 0.5}}]"
+    flown = fly_fleet("gap", way, "fleet.robots=2", "cell.rate_kbit=1000")
+    for flight in flown:
+        scans, seen = flight["/scan"], flight["/perception"]
+        assert len(scans) > 20
+        assert np.isin(seen["seen_stamp_ns"], scans["stamp_ns"]).all()
+        acted = np.isin(datagrams(seen), datagrams(flight["/command_applied"]))
+        assert acted.mean() > 0.8
+        steered = (flight["/setpoint_position"]["setpoint"][:, :2] != goal).any(axis=1)
+        assert steered.mean() > 0.5
+    first, second = (flight["/scan"]["ranges"][:20] for flight in flown)
+    assert not np.array_equal(first, second), "each scanner has its own noise"
 
 
 def test_how_far_robots_fly_on_alone_changes_nothing(monkeypatch):
