@@ -244,14 +244,17 @@ def chromium():
 def browse(chromium):
     """Open pages: browse(url) returns a page of Playwright, 1280 x 800.
 
+    A `script` runs in the page before its own.
     At the end of the test, no page may have had an error or a request to another server.
     """
     size = {"viewport": {"width": 1280, "height": 800}, "device_scale_factor": 0.5}
     context = chromium.new_context(**size)  # a quarter of the pixels: a processor draws them
     errors, requests, own = [], [], []
 
-    def open_page(url, **options):
+    def open_page(url, script=None, **options):
         page = context.new_page()
+        if script:
+            page.add_init_script(script)
         page.on("console", lambda said: said.type == "error" and errors.append(said.text))
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("request", lambda request: requests.append(request.url))
