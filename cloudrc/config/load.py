@@ -224,11 +224,16 @@ def _without_sensor(experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
     """List the keys that need a scanner or a camera, if the robot has none."""
     robot, perception = experiment.world.robot, experiment.cloud.perception
     if experiment.scans and known_robot(robot).scan is None:
-        path = ("cloud", "perception") if perception else ("world", "scan")
+        path, value = ("world", "scan"), "true"
+        if perception is not None and not experiment.world.scan:
+            path, value = ("cloud", "perception"), perception.name
         text = f"{robot} has no scanner: choose the rover, or give its robot.yaml the key scan"
-        yield ConfigProblem(path, perception.name if perception else "true", text)
+        yield ConfigProblem(path, value, text)
     if experiment.camera is not None and known_robot(robot).camera is None:
-        text = f"{robot} has no camera: choose x2, or give its robot.yaml the key camera"
+        text = (
+            f"{robot} has no camera: leave camera out, choose x2, or give its robot.yaml the key "
+            "camera"
+        )
         yield ConfigProblem(("camera",), experiment.camera.codec, text)
 
 

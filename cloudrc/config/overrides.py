@@ -272,21 +272,37 @@ def _complete(
     wrong parameter or a plug-in that fails.
     """
     kind, plans = KINDS[path[1]], draft.cloud.plan_s > 0
-    # With a camera, the robot's scanner works if world.scan says so.
-    films, scans = draft.camera is not None, draft.camera is None or draft.world.scan
     for parameter, field in parameter_model(kind, name).model_fields.items():
         if field.annotation == Path | None and isinstance(given.get(parameter), str):
             given[parameter] = str(document.source((*path, parameter)).absolute(given[parameter]))
-    key = ("plug-in", kind, name, json.dumps(given), plans, films, scans, repr(robot))
-    sensors = {"camera": films, "scan": scans}
-    return reuse(key, lambda: _try(kind, name, given, robot, sensors, plans=plans))
+    lacks = _lacks(draft)
+    key = ("plug-in", kind, name, json.dumps(given), plans, *lacks.values(), repr(robot))
+    return reuse(key, lambda: _try(kind, name, given, robot, lacks, plans=plans))
 
 
-SENSOR_MISSES = {
-    "camera": "takes pictures: give the experiment a section camera, such as camera: {codec: jpeg}",
-    "scan": "takes scans: set world.scan=true, or leave the section camera out",
-}
-"""Sensor that a perception takes -> what to do if it does not work."""
+def _lacks(draft: Experiment) -> dict[str, str]:
+    """Return sensor -> why a perception cannot take its data, and what to do; "" if it can."""
+    name, camera, scan = draft.world.robot, "", ""
+    robot = known_robot(name)
+    if robot.camera is None:
+        camera = (
+            f"takes pictures, but {name} has no camera: choose another perception or x2, or give "
+            "its robot.yaml the key camera"
+        )
+    elif draft.camera is None:
+        camera = (
+            "takes pictures: give the experiment a section camera, such as camera: {codec: jpeg}"
+        )
+    if robot.scan is None:
+        scan = (
+            f"takes scans, but {name} has no scanner: choose another perception or the rover, or "
+            "give its robot.yaml the key scan"
+        )
+    # With a camera, the scanner works if world.scan says so. Of a section camera without a camera,
+    # the check of the whole experiment tells.
+    elif draft.camera is not None and robot.camera is not None and not draft.world.scan:
+        scan = "takes scans: set world.scan=true, or leave the section camera out"
+    return {"camera": camera, "scan": scan}
 
 
 def _try(
@@ -294,13 +310,13 @@ def _try(
     name: str,
     given: dict[str, Any],
     robot: RobotFacts,
-    sensors: dict[str, bool],
+    lacks: dict[str, str],
     *,
     plans: bool,
 ) -> dict[str, Any]:
     """Build a plug-in, with `plans` for a cloud that sends plans; return all its parameters.
 
-    `sensors` tells which sensors of the robot work.
+    `lacks` is that of `_lacks`.
     """
     for parameter in given:
         if (kind, parameter) in GIVEN:
@@ -310,10 +326,10 @@ def _try(
         values: dict[str, Any] = checked.model_dump(mode="json")
     plugin = _build(kind, name, checked, {"robot": robot})
     if kind == "perceptions":
-        if plugin.takes not in sensors:
+        if plugin.takes not in lacks:
             raise BadInputError(f"'{name}' takes {plugin.takes!r}; takes must be scan or camera")
-        if not sensors[plugin.takes]:
-            raise BadInputError(f"'{name}' {SENSOR_MISSES[plugin.takes]}")
+        if lack := lacks[plugin.takes]:
+            raise BadInputError(f"'{name}' {lack}")
     if plans and name in OUTSIDE:
         raise BadInputError(f"'{name}' cannot plan ahead; set cloud.plan_s to 0")
     if plans and kind == "predictors":

@@ -246,7 +246,8 @@ def test_a_perception_gets_pictures_and_flies_by_them(tmp_path):
         (["camera.codec=mjpeg"], "camera.codec"),
         (["camera.quality=0"], "camera.quality"),
         (["fleet.robots=2"], "camera"),
-        (["cloud.perception=gap"], "world.scan=true"),
+        (["cloud.perception=gap"], "'gap' takes scans, but x2 has no scanner"),
+        (["world.scan=true"], "world.scan: true: x2 has no scanner"),
         (["cloud.perception=PATH"], "takes must be scan or camera"),
     ],
 )
@@ -257,6 +258,22 @@ def test_bad_input_is_refused_in_one_line(settings, where, tmp_path):
         load(*(each.replace("PATH", str(path)) for each in settings))
     assert where in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_camera_that_the_robot_does_not_have_is_named_and_not_the_perception_of_scans():
+    with pytest.raises(BadInputError, match=r"camera: jpeg: rover has no camera: leave camera out"):
+        load_experiment("gap", ["camera.codec=jpeg"])
+
+
+def test_a_perception_of_scans_beside_a_camera_needs_world_scan(tmp_path):
+    rover = Path("cloudrc/robots/rover").resolve()
+    (tmp_path / "robot.xml").write_bytes((rover / "robot.xml").read_bytes())
+    text = (rover / "robot.yaml").read_text()
+    (tmp_path / "robot.yaml").write_text(f"{text}\ncamera: {{name: front}}\n")
+    settings = [f"world.robot={tmp_path}", "camera.codec=jpeg"]
+    with pytest.raises(BadInputError, match=r"'gap' takes scans: set world.scan=true"):
+        load_experiment("gap", settings)
+    assert load_experiment("gap", [*settings, "world.scan=true"]).scans
 
 
 def test_a_perception_of_pictures_needs_a_camera(tmp_path):
