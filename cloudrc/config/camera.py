@@ -47,3 +47,7 @@ class CodecConfig(Section):
     """Time between two key frames of H.264 [s]"""
     keep: bool = False
     """Whether the recording holds the pictures that cloud had"""
+
+
+OF_CODEC = {"jpeg": ("quality",), "h264": ("kbit", "key_every_s")}
+"""Codec -> the keys of `CodecConfig` that only it has."""

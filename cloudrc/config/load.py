@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
+from cloudrc.config.camera import OF_CODEC
 from cloudrc.config.cloud import Cloud
 from cloudrc.config.compute import compute_times
 from cloudrc.config.faults import NOT_IN_CLUSTER
@@ -204,7 +205,8 @@ def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> Res
 
 
 def _without_effect(document: Document, experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
-    """List the settings of the link that another key replaces: their flights would be equal."""
+    """List the settings that another key replaces or switches off: their flights would be equal."""
+    yield from _of_other_codec(document, experiment)
     for way in DIRECTIONS:
         if experiment.cell.rate_kbit is not None and getattr(experiment, way).rate_kbit is not None:
             path = "link", way, "rate_kbit"
@@ -217,6 +219,22 @@ def _without_effect(document: Document, experiment: ResolvedExperiment) -> Itera
             path = "link", way, key
             if document.get(*path) is not None and document.source(path).is_setting:
                 text = f"has no effect, because link.{way}.trace replaces it; set that to null"
+                yield ConfigProblem(path, str(document.get(*path)), text)
+
+
+def _of_other_codec(document: Document, experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
+    """List the settings of the camera that only another codec has.
+
+    A file may hold the keys of both codecs, so that a setting chooses one.
+    """
+    if experiment.camera is None:
+        return
+    chosen = experiment.camera.codec
+    for codec, keys in OF_CODEC.items():
+        for key in keys if codec != chosen else ():
+            path = "camera", key
+            if document.get(*path) is not None and document.source(path).is_setting:
+                text = f"has no effect with codec {chosen}; set camera.codec={codec}"
                 yield ConfigProblem(path, str(document.get(*path)), text)
 
 

@@ -13,6 +13,7 @@ import pytest
 from cloudrc import assembly
 from cloudrc.assembly import build_cloud, build_links, build_world, start_mission
 from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import dump
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.errors import BadInputError
 from cloudrc.metrics.age import describe, sawtooth
@@ -245,6 +246,8 @@ def test_a_perception_gets_pictures_and_flies_by_them(tmp_path):
         (["world.robot=rover", "mission.waypoints=[{position_m: [1, 0]}]"], "camera"),
         (["camera.codec=mjpeg"], "camera.codec"),
         (["camera.quality=0"], "camera.quality"),
+        (["camera.kbit=300"], "--set: camera.kbit: 300: has no effect with codec jpeg; set camera"),
+        (["camera={key_every_s: 2}"], "key_every_s: 2: has no effect with codec jpeg"),
         (["fleet.robots=2"], "camera"),
         (["cloud.perception=gap"], "'gap' takes scans, but x2 has no scanner"),
         (["world.scan=true"], "world.scan: true: x2 has no scanner"),
@@ -258,6 +261,19 @@ def test_bad_input_is_refused_in_one_line(settings, where, tmp_path):
         load(*(each.replace("PATH", str(path)) for each in settings))
     assert where in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_file_may_hold_the_keys_of_both_codecs(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(dump(load_experiment("follow", ["camera.codec=h264", "camera.kbit=300"])))
+    camera = load_experiment(path, ["camera.codec=jpeg"]).camera
+    assert (camera.codec, camera.kbit, camera.quality) == ("jpeg", 300, 70)
+
+
+def test_a_setting_of_jpeg_has_no_effect_with_h264():
+    text = "--set: camera.quality: 50: has no effect with codec h264; set camera.codec=jpeg"
+    with pytest.raises(BadInputError, match=text):
+        load_experiment("follow", ["camera.codec=h264", "camera.quality=50"])
 
 
 def test_a_camera_that_the_robot_does_not_have_is_named_and_not_the_perception_of_scans():
