@@ -27,7 +27,7 @@ from cloudrc.gym.step import FILM, WAY, StepTime, layers
 from cloudrc.gym.values import checker, copied, neutral, size_of
 from cloudrc.link.library import PACKET_BYTES, LinkProfile
 from cloudrc.outside.refusal import check_names, naming
-from cloudrc.outside.values import InvalidValueError, Quantity, shorten
+from cloudrc.outside.values import InvalidValueError, Quantity
 
 if TYPE_CHECKING:
     from cloudrc.config.camera import CodecConfig
@@ -147,7 +147,7 @@ def _open_codec(
         if not shapes:
             raise InvalidValueError(
                 f"there is no image to encode: no uint8 array of shape (height, width, 3) in "
-                f"{shorten(space)}; leave it out"
+                f"{_form(space)}; leave it out"
             )
         if codec.codec == "h264" and any(rows % 2 or columns % 2 for rows, columns, _ in shapes):
             raise InvalidValueError(
@@ -155,6 +155,16 @@ def _open_codec(
                 "columns; choose jpeg"
             )
     return ObservationCodec(space, codec, dt)
+
+
+def _form(space: gymnasium.Space[Any]) -> str:
+    """Describe a space by the shapes and types of its arrays, such as "Box(4,) float32"."""
+    kind = type(space).__name__
+    if isinstance(space, gymnasium.spaces.Dict):
+        return f"{kind}({', '.join(f'{key}: {_form(part)}' for key, part in space.items())})"
+    if isinstance(space, gymnasium.spaces.Tuple):
+        return f"{kind}({', '.join(map(_form, space))})"
+    return f"{kind}{space.shape} {space.dtype}" if space.shape else kind
 
 
 def _usual_size(space: gymnasium.Space[Any], options: Options) -> int:

@@ -17,7 +17,7 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.gym import Channel, Networked, NetworkedVector
 from cloudrc.gym.doubts import LinkWarning
 from cloudrc.pictures import Jpeg, psnr
-from tests.gym.envs import Counter, both_ways
+from tests.gym.envs import Counter, Mixed, both_ways
 
 
 def image(count, rows, columns):
@@ -199,7 +199,11 @@ def test_each_robot_of_a_vector_has_a_codec_of_its_own():
         ("jpeg:0", Eyes(), r"codec jpeg:0: .*'0'.* whole number >= 1 and <= 95.*such as jpeg:70"),
         ("jpeg:", Eyes(), "whole number"),
         ("h264:5", Eyes(), r">= 10 and <= 100000 \[kbit/s\]"),
-        ("jpeg", Counter(), r"no uint8 array of shape \(height, width, 3\) in Box"),
+        ("jpeg", Counter(), r"\(height, width, 3\) in Box\(1,\) float64; leave it out$"),
+        (
+            *("jpeg", Mixed()),
+            r"in Dict\(image: Box\(4, 4\) uint8, state: Tuple\(Discrete, Box\(3,\) float64\)\); ",
+        ),
         ("h264", Eyes(61), r"\(61, 80, 3\), and H.264 needs even"),
     ],
 )
