@@ -16,6 +16,8 @@ FAILED_NOTE = (
     f"{FAILED_MARK} contains flights that failed: a robot that hardly moves has small errors, too"
 )
 """Note below a table with such a mark."""
+LISTED = 30
+"""Most known names that an error about an unknown name lists, if it can name similar ones."""
 Paint: TypeAlias = Callable[[str, str], str]
 """Function that returns a text in a colour of the terminal, such as "red"."""
 
@@ -130,9 +132,13 @@ def csv_table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def unknown_name_text(what: str, name: str, available: list[str]) -> str:
-    """Return an error text for an unknown name: all known names, and the most similar name."""
-    known = ", ".join(available) or "none"
-    return f"no {what} named {name!r}; available: {known}{suggest_name(name, available)}"
+    """Return an error text for an unknown name: the known names, and the most similar name.
+
+    Of more than `LISTED` known names, it has the similar ones, if there are any.
+    """
+    near = difflib.get_close_matches(name, available, n=5) if len(available) > LISTED else []
+    label, known = "similar" if near else "available", ", ".join(near or available) or "none"
+    return f"no {what} named {name!r}; {label}: {known}{suggest_name(name, available)}"
 
 
 def suggest_name(name: str, available: list[str]) -> str:

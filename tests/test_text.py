@@ -4,7 +4,7 @@
 
 import csv
 
-from cloudrc.text import cells, csv_table, latex_table, table
+from cloudrc.text import cells, csv_table, latex_table, table, unknown_name_text
 
 ROWS = [
     ("round trip", "95 %", "x_y", "note"),
@@ -49,3 +49,12 @@ def test_a_cell_without_a_value_is_a_dash_and_a_column_of_them_is_left_out():
     rows = [{"age": 1.5, "a": 1}, {"age": None, "a": 2, "b": {"p": 0.25}}]
     columns = {"age": "{age:.0f} ms", "a, b": "{a}/{b[p]:.1g}", "late": "{late:.0%}"}
     assert cells(rows, columns) == [("age", "a, b"), ("2 ms", "-"), ("-", "2/0.2")]
+
+
+def test_of_many_known_names_an_error_lists_the_similar_ones():
+    many = [*map(str, range(1000, 1100)), "frame_age_p99", "frame_age_max"]
+    near = "similar: frame_age_p99, frame_age_max; did you mean frame_age_p99?"
+    assert unknown_name_text("number", "frame_age_p9", many).endswith(f"'frame_age_p9'; {near}")
+    assert unknown_name_text("number", "blur", many).endswith(f"available: {', '.join(many)}")
+    few = unknown_name_text("codec", "jpg", ["jpeg", "h264"])
+    assert few == "no codec named 'jpg'; available: jpeg, h264; did you mean jpeg?"
