@@ -35,7 +35,7 @@ class Statement(NamedTuple):
     number: int
     claim: str  # in our words
     holds: Callable[[Cells], bool]
-    found: Callable[[Cells], str]  # numbers of the published scheme
+    found: Callable[[Cells], str]  # numbers of the published scheme, if it names no other
     differs: str  # what differs from the paper, and why
 
 
@@ -272,7 +272,7 @@ STATEMENTS = (
         3,
         "all waypoints are reached",
         _every(lambda row: row["numbers"].get("waypoints_reached") == WAYPOINTS),
-        lambda cells: f"{reached(missions(cells))} waypoints",
+        lambda cells: f"{reached(missions(cells))} waypoints (both orders)",
         "A script sets the waypoints, in place of a person.",
     ),
     Statement(
@@ -303,8 +303,8 @@ STATEMENTS = (
         "the errors settle below 0.1 cm",
         _is_settled,
         lambda cells: (
-            f"{at(cells, HOVER, WORST, PUBLISHED)} mm in a hover, "
-            f"{at(cells, HOVER, WORST, RAISED)} mm with a higher onboard integral limit; "
+            f"{at(cells, HOVER, WORST, PUBLISHED)} mm in a hover (newest), "
+            f"{at(cells, HOVER, WORST, RAISED)} mm with a higher onboard integral limit (newest); "
             f"{at(cells, span('left', '.0f', 1e3))} mm before the next waypoint"
         ),
         "The weight of the arm needs 0.204 N in x, and the integral term of the published onboard "
@@ -323,7 +323,7 @@ STATEMENTS = (
         ),
         lambda cells: (
             f"{at(cells, span('min_clearance', '.3f'))} m of room; touched in "
-            f"{touching(missions(cells))} flights"
+            f"{touching(missions(cells))} flights (both orders)"
         ),
         "The paper has no number.",
     ),

@@ -24,7 +24,8 @@ CAPTION = (
     "arrival: the robot follows the command that arrives last, as published (`paper-verbatim`); "
     "newest: the newest command (`paper`). Delays: mean ± half of their range. P1-P2-P3: all three "
     f"in one mission, from 0, 10 and 20 s on; {HALVED}: the same with half of all delays. Medians "
-    "over the flights of a cell; x to y: the range over them."
+    "over the flights of a cell; x to y: the range over them. The numbers beside a statement are "
+    "of arrival, if they name neither newest nor both orders."
 )
 
 
@@ -124,7 +125,7 @@ def summary(document: Mapping[str, Any], numbers: Sequence[int] = range(1, 9)) -
     """Format the statements with these numbers as a table in Markdown."""
     chosen = [each for each in document["statements"] if each["number"] in numbers]
     rows = ([str(s["number"]), s["claim"], YES[s["reproduced"]], s["found"]] for s in chosen)
-    return _markdown([["", "the paper", "reproduced", "here, as published"], *rows])
+    return _markdown([["", "the paper", "reproduced", "here"], *rows])
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:
