@@ -156,6 +156,20 @@ def falls(rows: Sequence[Row]) -> str:
     return f"{len(every) - every.count(None)}/{len(every)}"
 
 
+def _falls(row: Row) -> bool:
+    """Whether the error falls to a tenth at each waypoint but the first and the last."""
+    between = _measured(row, "fallen")[1:-1]
+    return bool(between) and None not in between
+
+
+def where(rows: Sequence[Row]) -> str:
+    """Return ": " and at which waypoints the error falls, if it is all but the ends; else ""."""
+    flights = [_measured(row, "fallen") for row in rows]
+    ends = [end for fallen in flights for end in (*fallen[:1], *fallen[-1:])]
+    is_between = all(map(_falls, rows)) and ends.count(None) == len(ends)
+    return ": all but the first and the last" if is_between else ""
+
+
 def touching(rows: Sequence[Row]) -> str:
     """Count the flights that touch a pipe or another obstacle."""
     return f"{sum(each > 0 for each in values(rows, 'obstacle_contacts'))}/{len(rows)}"
@@ -231,12 +245,6 @@ def _is_settled(cells: Cells) -> bool:
     return bool(left) and max(left) < SMALL
 
 
-def _falls(row: Row) -> bool:
-    """Whether the error falls to a tenth at each waypoint but the first and the last."""
-    between = _measured(row, "fallen")[1:-1]
-    return bool(between) and None not in between
-
-
 def _every(holds: Callable[[Row], bool]) -> Callable[[Cells], bool]:
     return lambda cells: all(map(holds, missions(cells)))
 
@@ -294,6 +302,7 @@ STATEMENTS = (
         lambda cells: (
             f"peaks of {at(cells, span('peak', '.1f'))} m; a tenth of that after "
             f"{at(cells, span('fallen', '.1f'))} s, at {at(cells, falls)} waypoints"
+            f"{at(cells, where)}"
         ),
         "The first waypoint counts as reached at 0.15 m, before the error is a tenth. At the last "
         "one the board stops the robot 0.1 m before the setpoint.",

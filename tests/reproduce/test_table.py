@@ -112,6 +112,21 @@ def test_a_number_that_is_not_of_the_published_order_alone_says_so():
     assert found[7].endswith("touched in 0/16 flights (both orders)")
 
 
+@pytest.mark.parametrize(
+    ("fallen", "found"),
+    [
+        ([None, 3.0, None], "2/6 waypoints: all but the first and the last"),
+        ([3.0, 3.0, None], "4/6 waypoints"),
+        ([None, 3.0, 3.0], "4/6 waypoints"),
+        ([3.0, None, 3.0], "4/6 waypoints"),
+        ([None, None, None], "0/6 waypoints"),
+    ],
+)
+def test_the_waypoints_at_which_the_error_falls_are_told(fallen, found):
+    statements = describe(rows(measured={"fallen": fallen}))["statements"]
+    assert statements[4]["found"].endswith(f" s, at {found}" if any(fallen) else f", at {found}")
+
+
 def test_the_pages_have_the_heads_of_this_version():
     head = summary(describe(rows()), ())
     assert f"{head}\n| 1 |" in PAGE.read_text()
