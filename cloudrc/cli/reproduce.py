@@ -4,11 +4,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import again, tell, warn
 from cloudrc.cli.parser import COUNT_MAX, Options, Parser, read_count
+from cloudrc.errors import BadInputError
 from cloudrc.runs.folder import results_folder
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.text import escape
@@ -54,6 +56,8 @@ def execute(options: Options) -> int:
     from cloudrc.trials.rows import Rows
 
     require("the paper's mission", MODES["virtual"])
+    if options.link:
+        _check_link(options.link)
     with Progress("checks the flights"):
         flights = plan(options.seeds, options.link)
     if options.link:
@@ -72,6 +76,27 @@ def execute(options: Options) -> int:
             text = _write(folder, [rows.kept[each.key] for each in flights])
     print(f"\n{text}\n\n{escape(str(folder / 'reproduce.pdf'))}")
     return 0
+
+
+def _check_link(link: str) -> None:
+    """Raise a BadInputError if the link is neither a trace nor a profile."""
+    from cloudrc.config.profile import load_profile
+    from cloudrc.link.traces import read_trace
+    from cloudrc.reproduce.flights import traces_of
+
+    traces = {Path(os.path.abspath(each)) for each in traces_of(link).values()}
+    if not all(each.exists() for each in traces):
+        raise BadInputError(
+            f"--link {link}: there is no such file; give a trace of 'cloudrc link record', or a "
+            "profile such as lte"
+        )
+    try:
+        for each in sorted(traces):
+            read_trace(each)
+        if not traces:
+            load_profile(link)
+    except BadInputError as error:
+        raise BadInputError(f"--link: {error}") from None
 
 
 def _write(folder: Path, rows: Sequence[Row]) -> str:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -75,19 +76,27 @@ def _settings(factor: float) -> list[str]:
 
 
 def _settings_of(link: str) -> list[str]:
-    """Return the settings for a link of the reader: a profile, or a trace, each way or of both.
-
-    A trace begins elsewhere with each seed. `cloudrc link record -o mine.csv` may have written
-    mine-uplink.csv and mine-downlink.csv, which the name mine.csv means, too.
-    """
-    path = Path(link)
-    if path.suffix != ".csv":
+    """Return the settings for a link of the reader; a trace begins elsewhere with each seed."""
+    ways = traces_of(link)
+    if not ways:
         return [f"link.profile={link}"]
+    traces = (f"link.{way}.trace={each}" for way, each in ways.items())
+    return ["link.profile=ideal", *traces, "link.start_s=random"]
+
+
+def traces_of(link: str) -> dict[str, Path]:
+    """Return the trace of each way of a link of the reader, which may be one; {} for a profile.
+
+    `cloudrc link record -o mine.csv` may have written mine-uplink.csv and mine-downlink.csv, which
+    the name mine.csv means, too.
+    """
+    path = Path(os.path.expanduser(link))
+    if path.suffix != ".csv":
+        return {}
     ways = {way: path.with_stem(f"{path.stem}-{way}") for way in ("uplink", "downlink")}
     if path.exists() or not all(each.exists() for each in ways.values()):
         ways = dict.fromkeys(ways, path)
-    traces = (f"link.{way}.trace={each}" for way, each in ways.items())
-    return ["link.profile=ideal", *traces, "link.start_s=random"]
+    return ways
 
 
 def plan(seeds: int, link: str = "") -> list[PlannedFlight]:

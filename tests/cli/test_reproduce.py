@@ -43,5 +43,17 @@ def test_a_second_call_flies_what_is_missing(folder, call):
     assert {each["lte"] for each in document["quantities"]} > {"-"}
 
 
-def test_a_link_that_is_no_profile_is_refused(refused):
-    assert "no profile named 'ltee'" in refused("reproduce --link ltee")
+@pytest.mark.parametrize(
+    ("link", "begin", "part"),
+    [
+        ("ltee", "--link: no profile named 'ltee'", "did you mean lte?"),
+        ("mine.yaml", "--link: mine.yaml: ", "No such file"),
+        ("mine.csv", "--link mine.csv: there is no such file; ", "link record"),
+        ("bad.csv", "--link: trace ", "bad.csv"),
+    ],
+)
+def test_a_link_that_is_wrong_is_told_once(folder, refused, link, begin, part):
+    (folder / "bad.csv").write_text("a,b\n")
+    error = refused(f"reproduce --link {link}")
+    assert error.startswith(f"cloudrc: error: {begin}")
+    assert part in error
