@@ -11,6 +11,7 @@ from pathlib import Path
 from cloudrc.rank.entry import read_entry
 from cloudrc.rank.page import make_page
 from cloudrc.rank.score import in_order
+from cloudrc.rank.tasks import GRID
 from tools.markdown import table
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -44,9 +45,8 @@ def rows(tasks: Sequence[str], files: Sequence[Path]) -> str:
                 for each in entry["results"]
                 if each["rtt_ms"] is not None
             }
-            some = (f"{done[rtt]}/50" for rtt in (0, 10, 50, 100, 200, 600))
+            some = (str(done[rtt]) for rtt in GRID)
             name = f"`{entry['policy']}`, {entry['executor']}"
-            lines.append((f"`{task}`", name, entry["score"], f"{entry['area']:.2f}", *some))
-    return table(
-        "task | policy | score | area | 0 ms | 10 ms | 50 ms | 100 ms | 200 ms | 600 ms", lines
-    )
+            lines.append((f"`{task}`", name, entry["score"], f"{entry['area']:.3f}", *some))
+    head = " | ".join(("task", "policy, executor", "score", "area", *(f"{rtt:g}" for rtt in GRID)))
+    return table(head, lines)

@@ -10,6 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from cloudrc.errors import BadInputError
 from cloudrc.files import read_json, write_json
 from cloudrc.outside.refusal import naming, reading
 from cloudrc.outside.values import InvalidValueError
@@ -20,6 +21,8 @@ FAILED = {"score_ms": None, "score": "failed", "area": 0.0, "of": 0}
 """Score of a policy that gave a wrong answer, or none."""
 OF_A_DAY = ("date", "answer", "sha256")
 """What differs between two entries that are the same."""
+TEXTS = ("rank", "task", "policy", "executor", "failed", "answer", "code", "command", "date")
+"""Keys of an entry whose values are texts."""
 
 
 def write_entry(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
@@ -43,6 +46,8 @@ def _seal(entry: Mapping[str, Any]) -> str:
 
 def read_entry(path: Path) -> dict[str, Any]:
     """Read an entry of this version; raise an error that says why it is none."""
+    if not path.is_file():
+        raise BadInputError(f"{path}: there is no such file")
     entry = read_json(path)
     with naming(str(path)), reading(path, "is no entry of 'cloudrc rank'"):
         _check(entry)
@@ -50,6 +55,8 @@ def read_entry(path: Path) -> dict[str, Any]:
 
 
 def _check(entry: Mapping[str, Any]) -> None:
+    if wrong := [key for key in TEXTS if type(entry.get(key)) is not str]:
+        raise InvalidValueError(f"is no entry of 'cloudrc rank': it has no text {', '.join(wrong)}")
     if (version := entry["rank"]) != VERSION:
         raise InvalidValueError(f"is of version {version}; this cloudrc ranks version {VERSION}")
     if (task := entry["task"]) not in TASKS or entry["executor"] not in TASKS[task].executors:
@@ -58,11 +65,15 @@ def _check(entry: Mapping[str, Any]) -> None:
     if wrong := [name for name in right if told.get(name) != right[name]]:
         raise InvalidValueError(f"has another {', '.join(wrong)} than version {VERSION}: its hash")
     results: Results = entry["results"]
-    if results or not entry["failed"]:
+    if results and entry["failed"]:
+        raise InvalidValueError("was edited: it has results, and says that the policy failed")
+    if not entry["failed"]:
         _check_seeds(results)
     found = score(results) if results else FAILED
     if _seal(entry) != entry["sha256"] or any(entry[key] != found[key] for key in found):
         raise InvalidValueError("was edited: its hash is not that of its content; play it again")
+    if type(entry["versions"]["cloudrc"]) is not str:
+        raise InvalidValueError("does not say with which cloudrc it was played")
 
 
 def _check_seeds(results: Results) -> None:

@@ -20,10 +20,12 @@ from cloudrc.statistics import exact_interval
 COLOURS = ("#0b5394", "#a64d00", "#38761d", "#741b47", "#444444", "#7f6000")
 """Colours of lines, each with a contrast of at least 4.5 to white."""
 HEAD = (
-    *("place", "policy", "score", "area", NONE, *LINKS),
-    *("executor", "an answer took", "played", "cloudrc", "the same again"),
+    *("place", "policy, executor", "score", "area", NONE, *LINKS),
+    *("an answer took", "played", "cloudrc", "the same again"),
 )
 WIDTH, HEIGHT, LEFT, TOP = 640, 190, 46, 12  # of the inner part of a figure [px]
+Entry = tuple[Path, Mapping[str, Any]]
+"""The file of an entry, and what it has."""
 TEMPLATE = Template((Path(__file__).parent / "page.html").read_text(encoding="utf-8"))
 
 
@@ -39,44 +41,47 @@ def make_page(path: Path, files: Sequence[Path]) -> str:
 
     Raise a BadInputError that names the first file that is no entry of this version.
     """
-    entries = [(each, read_entry(each)) for each in files]
+    entries = dict[str, Entry]()
+    for file in files:
+        entry = read_entry(file)
+        entries.setdefault(entry["sha256"], (file, entry))  # a copy is no second entry
     parts = list[str]()
     for task in TASKS:
-        if mine := {file: each for file, each in entries if each["task"] == task}:
+        if mine := [each for each in entries.values() if each[1]["task"] == task]:
             parts.append(section(task, mine, path))
     return TEMPLATE.substitute(version=VERSION, tasks="".join(parts))
 
 
-def section(task: str, entries: Mapping[Path, Mapping[str, Any]], page: Path) -> str:
-    """Return the part of a page about a task; `entries` are its files and what they have."""
-    files = {each["sha256"]: file for file, each in entries.items()}
-    ranked = in_order(entries.values())
+def section(task: str, entries: Sequence[Entry], page: Path) -> str:
+    """Return the part of a page about a task with its entries."""
+    files = {entry["sha256"]: file for file, entry in entries}
+    ranked = in_order(entry for _, entry in entries)
     head = "".join(f'<th><button type="button">{each}</button></th>' for each in HEAD)
-    lines = list[str]()
+    lines, failed = list[str](), list[str]()
     for n, (place, entry) in enumerate(ranked):
         link = Path(os.path.relpath(files[entry["sha256"]], page.parent)).as_posix()
         cells = "".join(f"<td>{each}</td>" for each in cells_of(entry))
-        name = f'<a href="{escape(link)}">{escape(Path(entry["policy"]).name)}</a>'
+        words = escape(f"{Path(entry['policy']).name}, {entry['executor']}")
+        name = f'<a href="{escape(link)}">{words}</a>'
         mark = f'<svg width="14" height="10"><path d="M0 5h14" {_stroke(n)}/></svg>'
         lines.append(f"<tr><td>{place or '-'}</td><td>{mark} {name}</td>{cells}</tr>")
-    figure = draw([entry["results"] for _, entry in ranked])
+        if entry["failed"]:
+            failed.append(f"<p>{words}, failed: {escape(entry['failed'])}</p>")
+    figure = draw([entry["results"] for _, entry in ranked], task)
     return (
         f'<section id="{task}"><h2>{task}</h2><p>{escape(TASKS[task].about)}</p>'
         f'<div class="wide"><table><thead><tr>{head}</tr></thead>'
-        f"<tbody>{''.join(lines)}</tbody></table></div>{figure}</section>\n"
+        f"<tbody>{''.join(lines)}</tbody></table></div>{''.join(failed)}{figure}</section>\n"
     )
 
 
 def cells_of(entry: Mapping[str, Any]) -> Iterator[str]:
     """Yield the cells of an entry behind its name, as HTML."""
-    if entry["failed"]:
-        yield f'<span title="{escape(entry["failed"])}">failed</span>'
-    else:
-        yield entry["score"]
+    yield entry["score"]
     yield f"{entry['area']:.3f}"
     done = {each["link"]: each["success"] for each in entry["results"] if each["rtt_ms"] is None}
     yield from (rate(done[each]) if each in done else "-" for each in (NONE, *LINKS))
-    yield from (entry["executor"], entry["answer"], entry["date"])
+    yield from (escape(entry["answer"]), escape(entry["date"]))
     yield escape(f"{entry['versions']['cloudrc']} ({entry['code']})")
     yield f"<code>{escape(entry['command'])}</code>"
 
@@ -93,7 +98,7 @@ def _stroke(n: int) -> str:
     return f'fill="none" stroke="{COLOURS[n % len(COLOURS)]}" stroke-width="2"{dash}'
 
 
-def draw(every: Sequence[Sequence[Mapping[str, Any]]]) -> str:
+def draw(every: Sequence[Sequence[Mapping[str, Any]]], task: str) -> str:
     """Draw the success of each entry over the round trip, with its 95 % intervals, as SVG.
 
     The round trips of the grid are equally far apart.
@@ -122,7 +127,7 @@ def draw(every: Sequence[Sequence[Mapping[str, Any]]]) -> str:
         parts.append(f'<text x="{LEFT - 6}" y="{y + 4}" text-anchor="end">{share:.0%}</text>')
     return (
         f'<svg class="figure" viewBox="0 0 {LEFT + WIDTH + 8} {TOP + HEIGHT + 36}" role="img" '
-        f'aria-label="success over the round trip">{"".join(parts)}'
+        f'aria-label="success in {task} over the round trip">{"".join(parts)}'
         f'<text x="{LEFT + WIDTH / 2:.0f}" y="{TOP + HEIGHT + 32}" text-anchor="middle">'
         "round trip [ms], constant</text></svg>"
     )

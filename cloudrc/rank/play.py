@@ -102,6 +102,7 @@ class Played:
         rows = Rows(self.rows_folder).kept
         results = [] if failed else [_result(rows, *each) for each in self.trials.items()]
         entrant, own = self.entrant, self.setup.policy
+        failed = failed.replace(own, entrant.policy)  # no path of this machine
         made = provenance(self.setup, entrant.command)
         packages = [module for each in entrant.extras for module in EXTRAS[each]]
         loaded = [each for each in (*LIBRARIES, *packages) if find_spec(each)]

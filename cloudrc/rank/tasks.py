@@ -111,16 +111,22 @@ TASKS = {
         extras=("gym", *SIM),
     ),
     "hover-velocity": RankTask(
-        "command the velocity of the same drone, whose controller is on board",
+        "command the velocity of the drone of hover-motors, whose controller is on board, from the "
+        "floor; after 8 s it is within 20 cm of its place, about 1 m above",
         (Shipped("velocity"),),
         _own("Velocities"),
         extras=("gym", *SIM),
     ),
-    "reach-v3": _arm("reach for a point with the arm of Meta-World", "reach-v3"),
-    "push-v3": _arm("push a puck to a point with the arm of Meta-World", "push-v3"),
-    "door-open-v3": _arm("open a door with the arm of Meta-World", "door-open-v3"),
+    "reach-v3": _arm("reach for a point with the arm of Meta-World, within 300 steps", "reach-v3"),
+    "push-v3": _arm(
+        "push a puck to a point with the arm of Meta-World, within 300 steps", "push-v3"
+    ),
+    "door-open-v3": _arm(
+        "open a door with the arm of Meta-World, within 300 steps", "door-open-v3"
+    ),
     "gap": RankTask(
-        "drive a rover along a corridor with pillars by its scans alone",
+        "drive a rover along a corridor with pillars by its scans alone, to its end within "
+        "40 s and without a touch",
         _SEEN,
         experiment="gap",
         extras=("gym", *SIM),

@@ -151,19 +151,22 @@ def test_a_policy_that_answers_nan_is_a_row_and_not_dropped(call, short, tmp_pat
     made = entries.read_entry(tmp_path / "entry.json")
     assert (made["score"], made["results"]) == ("failed", [])
     write_page(tmp_path / "page.html", [tmp_path / "entry.json"])
-    assert ">failed</span>" in (tmp_path / "page.html").read_text()
+    page = (tmp_path / "page.html").read_text()
+    assert "<td>failed</td>" in page
+    assert f"{file}, newest, failed: " not in page
+    assert "nan.py, newest, failed: " in page
 
 
 @pytest.fixture
 def write(tmp_path):
     """Return a function that writes an entry with some results, and returns its path."""
 
-    def write(policy, made):
+    def write(policy, made, date="2026-11-30"):
         content = {
             **{"schemaVersion": 1, "rank": "1", "task": "linear", "policy": policy},
             **{"executor": "newest", **score(made), "failed": "", "answer": "below 1 ms"},
             **{"hashes": tasks.pinned("linear"), "results": made, "code": "0123"},
-            **{"versions": {"cloudrc": "1"}, "command": "cloudrc rank", "date": "2026-11-30"},
+            **{"versions": {"cloudrc": "1"}, "command": "cloudrc rank", "date": date},
         }
         entries.write_entry(path := tmp_path / f"{policy}.json", content)
         return path
@@ -186,7 +189,25 @@ def fewer(content):
         each["success"] = each["success"][:20]
 
 
+def reseal(content):
+    content["sha256"] = entries._seal(content)
+
+
+def both(content):
+    content["failed"] = "it answered NaN"
+    reseal(content)
+
+
+def without_versions(content):
+    content["versions"] = {}
+    reseal(content)
+
+
 FALSE = {
+    "was edited: it has results, and says": both,
+    "it has no text command": lambda content: content.update(command=3),
+    "it has no text policy": lambda content: content.pop("policy"),
+    "is no entry of 'cloudrc rank' ('cloudrc')": without_versions,
     "is of version 2; this cloudrc ranks version 1": lambda content: content.update(rank="2"),
     "has another link wifi than version 1": lambda content: content["hashes"].update(
         {"link wifi": "0"}
@@ -208,6 +229,28 @@ def test_a_false_entry_is_refused_by_name(why, real, call):
     assert why in said
 
 
+def test_a_file_that_is_not_there_is_named(call, tmp_path):
+    said = call(f"rank page {tmp_path}/nosuch.json", code=2).err
+    assert f"{tmp_path}/nosuch.json: there is no such file" in said
+
+
+def test_no_text_of_an_entry_is_a_part_of_the_page(real, tmp_path):
+    content = json.loads(real.read_text())
+    for key in ("date", "answer", "code", "command", "policy"):
+        content[key] = f"<script>{key}</script>"
+    reseal(content)
+    real.write_text(json.dumps(content))
+    write_page(tmp_path / "page.html", [real])
+    found = (tmp_path / "page.html").read_text()
+    assert found.count("<script>") == 1, "that of the page"
+
+
+def test_a_copy_of_an_entry_is_no_second_one(real, tmp_path):
+    (copy := tmp_path / "copy.json").write_bytes(real.read_bytes())
+    write_page(tmp_path / "page.html", [real, copy])
+    assert (tmp_path / "page.html").read_text().count("entry.json") == 1
+
+
 def test_what_is_not_installed_is_named_with_its_extra(call, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if "world" in name else 1)
     said = call("rank --task reach-v3", code=3).err
@@ -223,14 +266,16 @@ def test_the_page_sorts_by_every_column_and_can_be_read(write, browse, tmp_path)
         "none": results(lost(9), *[lost(1)] * 9),
         **{f"other {n}": results(lost(n)) for n in range(2, 6)},  # more than there are colours
     }
-    write_page(tmp_path / "page.html", [write(*each) for each in made.items()])
+    dates = [f"2026-11-{day:02}" for day in range(30, 0, -3)]
+    files = [write(*each, date) for each, date in zip(made.items(), dates, strict=False)]
+    write_page(tmp_path / "page.html", files)
     page = browse((tmp_path / "page.html").as_uri())
 
     def order(head, clicks):
         for _ in range(clicks):
             page.locator("th button", has_text=head).click()
         cells = page.locator("tbody tr td:nth-child(2)").all_inner_texts()
-        return [each.strip() for each in cells]
+        return [each.strip().removesuffix(", newest") for each in cells]
 
     by_place = order("place", 0)
     assert by_place[:2] == ["far", "near"]
@@ -238,6 +283,7 @@ def test_the_page_sorts_by_every_column_and_can_be_read(write, browse, tmp_path)
     assert order("policy", 1) == sorted(made, reverse=True)
     assert order("score", 2)[:2] == ["far", "near"], "none and - come last"
     assert order("area", 2)[0] == "none", "it wins the most"
+    assert order("played", 1) == [*made][::-1]
     page.locator("tbody a", has_text="near").click()
     assert page.url.endswith("near.json")
     page.go_back()

@@ -12,8 +12,8 @@ from typing import Any
 
 POLE, GAIN = 1.05, 0.12
 ACTION_MAX = 100.0
-"""Largest action [1]. Over a delay that varies the policy may find a wrong one, and its answers would
-grow without a bound. A constant delay of 600 ms needs less."""
+"""Largest action [1]. Over a delay that varies the policy may find a wrong one, and its answers
+would grow without a bound. A constant delay of 600 ms needs less."""
 
 
 class Smith:
