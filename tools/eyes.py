@@ -33,7 +33,7 @@ MEDIANS = {57: "5G SA, edge", 68: "5G NSA, edge", 106: "5G SA, cloud", 140: "5G 
 Source: "Is the edge really necessary for drone computing offloading? An experimental assessment in
 carrier-grade 5G operator networks", Software: Practice and Experience 53 (3), 2023,
 doi:10.1002/spe.3161."""
-QUEUES, RATES, SEEDS = ("fifo", "priority"), (0, 200, 400, 600, 700), 6
+QUEUES, RATES, SEEDS = ("fifo", "priority"), (0, 200, 400, 600, 700), 10
 """Queues of the cell, bit rates of the video [kbit/s], flights of each."""
 LANES = (
     *("cell.rate_kbit=1000", "link.both.delay_ms=20", "world.wind.gust_mps=1"),
