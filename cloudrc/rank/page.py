@@ -82,7 +82,7 @@ def cells_of(entry: Mapping[str, Any]) -> Iterator[str]:
     done = {each["link"]: each["success"] for each in entry["results"] if each["rtt_ms"] is None}
     yield from (rate(done[each]) if each in done else "-" for each in (NONE, *LINKS))
     yield from (escape(entry["answer"]), escape(entry["date"]))
-    yield escape(f"{entry['versions']['cloudrc']} ({entry['code']})")
+    yield escape(f"{entry['versions']['cloudrc']} ({entry['code'][:7]})")
     yield f"<code>{escape(entry['command'])}</code>"
 
 
@@ -104,6 +104,10 @@ def draw(every: Sequence[Sequence[Mapping[str, Any]]], task: str) -> str:
     The round trips of the grid are equally far apart.
     """
     parts = list[str]()
+    for share in (0.0, 0.5, 1.0):  # below the lines of the entries
+        y = _height(share)
+        parts.append(f'<path d="M{LEFT} {y}h{WIDTH}" stroke="#ccc"/>')
+        parts.append(f'<text x="{LEFT - 6}" y="{y + 4}" text-anchor="end">{share:.0%}</text>')
     for n, results in enumerate(every):
         grid = [each for each in results if each["link"] == CONSTANT]
         points = list[str]()
@@ -121,15 +125,11 @@ def draw(every: Sequence[Sequence[Mapping[str, Any]]], task: str) -> str:
             f'<text x="{x:.0f}" y="{TOP + HEIGHT + 16}" text-anchor="middle">'
             f"{each['rtt_ms']:g}</text>"
         )
-    for share in (0.0, 0.5, 1.0):
-        y = _height(share)
-        parts.append(f'<path d="M{LEFT} {y}h{WIDTH}" stroke="#ccc"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{y + 4}" text-anchor="end">{share:.0%}</text>')
     return (
         f'<svg class="figure" viewBox="0 0 {LEFT + WIDTH + 8} {TOP + HEIGHT + 36}" role="img" '
         f'aria-label="success in {task} over the round trip">{"".join(parts)}'
         f'<text x="{LEFT + WIDTH / 2:.0f}" y="{TOP + HEIGHT + 32}" text-anchor="middle">'
-        "round trip [ms], constant</text></svg>"
+        "episodes won over the round trip [ms], constant</text></svg>"
     )
 
 
