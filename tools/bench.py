@@ -2,7 +2,7 @@
 
 """`make bench`: how much processor time does a flight cost, and has a change made it cheaper?
 
-    make bench                      # flights beside `steps`, steps of `Networked`, and `follow`
+    make bench                      # flights beside `steps`, with sensors, steps of `Networked`
     make bench AGAINST=COMMIT       # the loop and a sweep's flight, beside those of another commit
     make bench AGAINST=COMMIT FLIGHTS=20 ROWS=fast      # the rows that have this word in their name
 
@@ -60,6 +60,11 @@ KINDS = {
     "fast over legs, x2": ("fast", (*LEGS, "world.robot=x2"), "loop", None),
 }
 """Rows beside `steps`, likewise."""
+AWAY = "{position_m: [2, 0, 0.1]}, {position_m: [0, 0, 0.1]}"
+SHORT = ("cloud.perception=null", f"mission.waypoints=[{AWAY}, {AWAY}, {AWAY}]")
+"""`gap` by waypoints before the first pillar: the same way with scans and without them."""
+SCANS = {"gap": (SHORT, 1.1), "gap, pipes": ((*SHORT, "world.scene=pipes"), None)}
+"""Flights with scans: settings, and the largest ratio to those without."""
 ENVIRONMENTS = "CartPole-v1", "Pendulum-v1"
 STEP_MAX = 20.0
 """Largest processor time of a step of `Networked`, without the environment's [us]."""
@@ -178,6 +183,20 @@ def beside_steps(names: Sequence[str], flights: int) -> list[tuple[str, ...]]:
     return rows
 
 
+def scans(flights: int) -> list[tuple[str, ...]]:
+    """Fly `gap` by waypoints, with scans and without them."""
+    head = "flight of a sweep, 181 rays at 10 Hz", "ms per s", "without", "ratio", "interval"
+    rows: list[tuple[str, ...]] = [(*head, "asked", "")]
+    with tempfile.TemporaryDirectory() as cache, Tree(ROOT, Path(cache)) as tree:
+        for name, (settings, most) in SCANS.items():
+            flown = [
+                (tree, ("gap", (*settings, f"world.scan={each}"), "sweep"))
+                for each in ("true", "false")
+            ]
+            rows.append(row(name, *measure(flown, flights), most))
+    return rows
+
+
 def steps_of(env: Any, actions: Sequence[Any]) -> list[float]:
     """Return the processor time of each step [s], in the same episodes with each call."""
     env.reset(seed=0)
@@ -288,7 +307,7 @@ def main() -> int:
     else:
         names = [name for name in names if name != STEPS]
         tables = [beside_steps(names, options.flights)]
-        tables += [] if options.rows else [networked(), shared(), camera()]
+        tables += [] if options.rows else [scans(options.flights), networked(), shared(), camera()]
     for rows in tables:
         print(table(rows, right=range(1, 5)), end="\n\n", flush=True)
     return int(any("MISSED" in row for rows in tables for row in rows))
