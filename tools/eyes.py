@@ -73,14 +73,15 @@ def losses(folder: Path) -> str:
     def cells() -> Iterator[list[str]]:
         for uplink, mine in named.items():
             for codec, rows in by(mine, "codec").items():
-                ages = [middle(of(rows, f"frame_age_{name}"), 0, 1e-3) for name in ("mean", "p99")]
+                names = (f"frame_age_{each}" for each in ("mean", "p99", "max"))
+                ages = [middle(of(rows, name), 0, 1e-3) for name in names]
                 rate, shown = middle(of(rows, "video_kbit"), 0), middle(of(rows, "frames_shown"), 2)
                 away = middle(of(rows, "out_of_view"), 0, 0.01)
                 yield [uplink, codec, str(len(rows)), rate, shown, *ages, away]
 
     return table(
         "uplink | codec | flights | kbit/s | pictures shown | age of the newest [ms] | p99 [ms] "
-        "| out of view [%]",
+        "| peak [ms] | out of view [%]",
         cells(),
     )
 
