@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "rank"
 MARKS = re.compile(r"(<!-- ranked: (.*) -->\n).*?(<!-- end of ranking -->)", re.DOTALL)
 """Around a generated table; the first mark names its tasks."""
-PAGES = ("ranking.md", "results.md")
+PAGES = ("eval.md", "ranking.md", "results.md")
 
 
 def outputs() -> dict[Path, str]:
