@@ -26,6 +26,8 @@ from cloudrc.config.schema import Positive
 from cloudrc.messages import Command, Odometry
 
 Array = NDArray[np.float64]
+Rows = tuple[tuple[float, float], tuple[float, float]]
+"""A covariance of position and velocity, row by row."""
 
 
 class Kalman(Predictor):
@@ -38,7 +40,7 @@ class Kalman(Predictor):
         is for the acceleration of the filter's model.
         """
         self._replay, self._error, self.is_foreign = replay, model * model, replay.is_foreign
-        self._noise = np.diag([position * position, velocity * velocity])
+        self._noise: Rows = ((position * position, 0.0), (0.0, velocity * velocity))
         self.reset()
 
     def reset(self) -> None:
@@ -62,7 +64,8 @@ class Kalman(Predictor):
         if before is None or forecast is None:
             self._covariance = self._noise
         else:
-            gains = self._update((odometry.stamp_ns - before.stamp_ns) * 1e-9)
+            dt = (odometry.stamp_ns - before.stamp_ns) * 1e-9
+            gains, self._covariance = _update(self._covariance, dt, self._noise, self._error)
             model = np.array((forecast.position, forecast.velocity))
             measured = np.array((odometry.position, odometry.velocity))
             position, velocity = (model + gains @ (measured - model)).tolist()
@@ -70,20 +73,6 @@ class Kalman(Predictor):
             estimate = Odometry(stamp_ns, tuple(position), orientation, tuple(velocity), rate)
         self._estimate = estimate
         self._replay.observe(estimate, forecast)
-
-    def _update(self, dt: float) -> Array:
-        """Advance the covariance by `dt` [s] and one sample; return the gains K, shape (2, 2).
-
-        With the covariances P of the state and R of a sample, F = (1 dt; 0 1), and an acceleration
-        error of variance q that is constant during `dt`:
-            P = F P F' + q · (dt^2/2, dt)' (dt^2/2, dt);  K = P (P + R)^-1;  P = (1 - K) P.
-        Source: R. E. Kalman, "A New Approach to Linear Filtering and Prediction Problems", 1960.
-        """
-        ahead, pushed = _motion(dt, self._error)
-        covariance = ahead @ self._covariance @ ahead.T + pushed
-        gains: Array = covariance @ np.linalg.inv(covariance + self._noise)
-        self._covariance = covariance - gains @ covariance
-        return gains
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Filter the newest sample `odometry`; extrapolate the result by `horizon` [s].
@@ -101,14 +90,20 @@ class Kalman(Predictor):
         return self._replay.model()
 
 
-@lru_cache(maxsize=64)  # telemetry comes in whole periods
-def _motion(dt: float, variance: float) -> tuple[Array, Array]:
-    """Return F, and the covariance after an acceleration error during `dt` [s], shape (2, 2) each.
+@lru_cache(maxsize=4096)  # telemetry comes in whole periods, so the covariance settles
+def _update(before: Rows, dt: float, noise: Rows, error: float) -> tuple[Array, Rows]:
+    """Advance a covariance by `dt` [s] and one sample; return the gains K, shape (2, 2), and it.
 
-    `variance` is that of the error [m^2/s^4].
+    `noise` is that of a sample, R; `error` is the variance q of the model's acceleration, which is
+    constant during `dt` [m^2/s^4]. With the covariance P and F = (1 dt; 0 1):
+        P = F P F' + q · (dt^2/2, dt)' (dt^2/2, dt);  K = P (P + R)^-1;  P = (1 - K) P.
+    Source: R. E. Kalman, "A New Approach to Linear Filtering and Prediction Problems", 1960.
     """
-    push = np.array((0.5 * dt * dt, dt))
-    return np.array(((1.0, dt), (0.0, 1.0))), variance * np.outer(push, push)
+    ahead, push = np.array(((1.0, dt), (0.0, 1.0))), np.array((0.5 * dt * dt, dt))
+    covariance = ahead @ np.array(before) @ ahead.T + error * np.outer(push, push)
+    gains: Array = covariance @ np.linalg.inv(covariance + np.array(noise))
+    first, second = (covariance - gains @ covariance).tolist()
+    return gains, (tuple(first), tuple(second))
 
 
 def build(
