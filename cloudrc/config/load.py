@@ -18,7 +18,6 @@ from typing import Any, TypeVar
 
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
-from cloudrc.config.camera import OF_CODEC
 from cloudrc.config.cloud import Cloud
 from cloudrc.config.compute import compute_times
 from cloudrc.config.faults import NOT_IN_CLUSTER
@@ -50,6 +49,7 @@ from cloudrc.config.resolved import (
 from cloudrc.config.robot import DEFAULT_LIMITS, known_robot
 from cloudrc.config.robot import facts as facts_of
 from cloudrc.config.schema import Experiment, MissionConfig, World
+from cloudrc.config.sensors import of_other_codec, without_sensor
 from cloudrc.errors import BadInputError
 from cloudrc.link.traces import read_trace
 from cloudrc.outside.document import Document, KeyPath, parse_value, read_document
@@ -198,7 +198,7 @@ def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> Res
     """Check that the mission fits the scene and the robot, and complete it with what they give."""
     mission = put_on_ground(experiment.mission, experiment.world)
     found = [*_without_effect(document, experiment)]
-    found += [*_without_sensor(experiment)] or _check_mission(mission, experiment)
+    found += [*without_sensor(experiment)] or _check_mission(mission, experiment)
     problems.raise_problems(document, found, name)
     mission = without_held_yaws(mission, known_robot(experiment.world.robot).heading)
     return experiment.model_copy(update={"mission": mission})
@@ -206,7 +206,7 @@ def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> Res
 
 def _without_effect(document: Document, experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
     """List the settings that another key replaces or switches off: their flights would be equal."""
-    yield from _of_other_codec(document, experiment)
+    yield from of_other_codec(document, experiment)
     for way in DIRECTIONS:
         if experiment.cell.rate_kbit is not None and getattr(experiment, way).rate_kbit is not None:
             path = "link", way, "rate_kbit"
@@ -220,39 +220,6 @@ def _without_effect(document: Document, experiment: ResolvedExperiment) -> Itera
             if document.get(*path) is not None and document.source(path).is_setting:
                 text = f"has no effect, because link.{way}.trace replaces it; set that to null"
                 yield ConfigProblem(path, str(document.get(*path)), text)
-
-
-def _of_other_codec(document: Document, experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
-    """List the settings of the camera that only another codec has.
-
-    A file may hold the keys of both codecs, so that a setting chooses one.
-    """
-    if experiment.camera is None:
-        return
-    chosen = experiment.camera.codec
-    for codec, keys in OF_CODEC.items():
-        for key in keys if codec != chosen else ():
-            path = "camera", key
-            if document.get(*path) is not None and document.source(path).is_setting:
-                text = f"has no effect with codec {chosen}; set camera.codec={codec}"
-                yield ConfigProblem(path, str(document.get(*path)), text)
-
-
-def _without_sensor(experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
-    """List the keys that need a scanner or a camera, if the robot has none."""
-    robot, perception = experiment.world.robot, experiment.cloud.perception
-    if experiment.scans and known_robot(robot).scan is None:
-        path, value = ("world", "scan"), "true"
-        if perception is not None and not experiment.world.scan:
-            path, value = ("cloud", "perception"), perception.name
-        text = f"{robot} has no scanner: choose the rover, or give its robot.yaml the key scan"
-        yield ConfigProblem(path, value, text)
-    if experiment.camera is not None and known_robot(robot).camera is None:
-        text = (
-            f"{robot} has no camera: leave camera out, choose x2, or give its robot.yaml the key "
-            "camera"
-        )
-        yield ConfigProblem(("camera",), experiment.camera.codec, text)
 
 
 def _check_mission(mission: MissionConfig, experiment: ResolvedExperiment) -> list[ConfigProblem]:

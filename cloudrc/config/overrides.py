@@ -34,6 +34,7 @@ from cloudrc.config.cloud import Cloud
 from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.robot import RobotFacts, known_robot, parameters
 from cloudrc.config.schema import Experiment, Steps, World
+from cloudrc.config.sensors import lacks_of
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.outside import code
@@ -275,34 +276,9 @@ def _complete(
     for parameter, field in parameter_model(kind, name).model_fields.items():
         if field.annotation == Path | None and isinstance(given.get(parameter), str):
             given[parameter] = str(document.source((*path, parameter)).absolute(given[parameter]))
-    lacks = _lacks(draft)
+    lacks = lacks_of(draft)
     key = ("plug-in", kind, name, json.dumps(given), plans, *lacks.values(), repr(robot))
     return reuse(key, lambda: _try(kind, name, given, robot, lacks, plans=plans))
-
-
-def _lacks(draft: Experiment) -> dict[str, str]:
-    """Return sensor -> why a perception cannot take its data, and what to do; "" if it can."""
-    name, camera, scan = draft.world.robot, "", ""
-    robot = known_robot(name)
-    if robot.camera is None:
-        camera = (
-            f"takes pictures, but {name} has no camera: choose another perception or x2, or give "
-            "its robot.yaml the key camera"
-        )
-    elif draft.camera is None:
-        camera = (
-            "takes pictures: give the experiment a section camera, such as camera: {codec: jpeg}"
-        )
-    if robot.scan is None:
-        scan = (
-            f"takes scans, but {name} has no scanner: choose another perception or the rover, or "
-            "give its robot.yaml the key scan"
-        )
-    # With a camera, the scanner works if world.scan says so. Of a section camera without a camera,
-    # the check of the whole experiment tells.
-    elif draft.camera is not None and robot.camera is not None and not draft.world.scan:
-        scan = "takes scans: set world.scan=true, or leave the section camera out"
-    return {"camera": camera, "scan": scan}
 
 
 def _try(
@@ -316,7 +292,7 @@ def _try(
 ) -> dict[str, Any]:
     """Build a plug-in, with `plans` for a cloud that sends plans; return all its parameters.
 
-    `lacks` is that of `_lacks`.
+    `lacks` is that of `lacks_of`.
     """
     for parameter in given:
         if (kind, parameter) in GIVEN:

@@ -10,7 +10,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from cloudrc.errors import BadInputError
 from cloudrc.files import read_json, write_json
 from cloudrc.outside.refusal import naming, reading
 from cloudrc.outside.values import InvalidValueError
@@ -46,10 +45,10 @@ def _seal(entry: Mapping[str, Any]) -> str:
 
 def read_entry(path: Path) -> dict[str, Any]:
     """Read an entry of this version; raise an error that says why it is none."""
-    if not path.is_file():
-        raise BadInputError(f"{path}: there is no such file")
     entry = read_json(path)
     with naming(str(path)), reading(path, "is no entry of 'cloudrc rank'"):
+        if not path.is_file():
+            raise InvalidValueError("there is no such file")
         _check(entry)
     return entry
 
