@@ -55,7 +55,7 @@ def read_entry(path: Path) -> dict[str, Any]:
 
 def _check(entry: Mapping[str, Any]) -> None:
     if wrong := [key for key in TEXTS if type(entry.get(key)) is not str]:
-        raise InvalidValueError(f"is no entry of 'cloudrc rank': it has no text {', '.join(wrong)}")
+        raise InvalidValueError(f"it has no text {', '.join(wrong)}")
     if (version := entry["rank"]) != VERSION:
         raise InvalidValueError(f"is of version {version}; this cloudrc ranks version {VERSION}")
     if (task := entry["task"]) not in TASKS or entry["executor"] not in TASKS[task].executors:

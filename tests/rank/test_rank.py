@@ -231,7 +231,7 @@ def test_a_false_entry_is_refused_by_name(why, real, call):
 
 def test_a_file_that_is_not_there_is_named(call, tmp_path):
     said = call(f"rank page {tmp_path}/nosuch.json", code=2).err
-    assert f"{tmp_path}/nosuch.json: there is no such file" in said
+    assert f"{tmp_path}/nosuch.json: is no entry of 'cloudrc rank' (there is no such file)" in said
 
 
 def test_no_text_of_an_entry_is_a_part_of_the_page(real, tmp_path):
