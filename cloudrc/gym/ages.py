@@ -6,6 +6,8 @@ from __future__ import annotations
 
 from math import nan
 
+import numpy as np
+
 from cloudrc.link.draws import Floats
 
 
@@ -17,12 +19,18 @@ def describe_ages(name: str, ages: Floats, dt: float) -> dict[str, float]:
     found = {"mean": nan, "p99": nan, "max": nan, "peak_mean": nan}
     if len(ages):
         *_, largest = ranked = sorted(ages.tolist())
-        found |= {"mean": ages.mean(), "p99": _percentile(ranked, 0.99), "max": largest}
+        found |= {"mean": _mean(ages), "p99": _percentile(ranked, 0.99), "max": largest}
     peaks = ages[:-1][ages[1:] - ages[:-1] < dt - 1e-9]
     if len(peaks):
-        found["peak_mean"] = peaks.mean()
+        found["peak_mean"] = _mean(peaks)
     numbers = {f"{name}_{part}": float(value) for part, value in found.items()}
     return {**numbers, f"{name}_of": len(ages)}
+
+
+def _mean(values: Floats) -> float:
+    """Return what `np.mean` returns, bit by bit, in half of its time."""
+    total: float = np.add.reduce(values)
+    return total / len(values)
 
 
 def _percentile(ranked: list[float], share: float) -> float:

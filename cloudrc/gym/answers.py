@@ -85,10 +85,17 @@ class Answers:
 
     def means(self) -> dict[str, float]:
         """Return `budget_` and the name of each stage -> its mean [s] over executed answers."""
-        executed = [row for row in self._rows() if row[-1] != NEVER_NS]
+        done = [number for number in self.begun if number in self._executed]
+        ticks = [self.begun[number][0] for number in done]
+        observed_ns = sum(map(self.observed.__getitem__, ticks))
         # Whole numbers: the sum of differences is the difference of sums.
-        _, *sums_ns = map(sum, zip(*executed, strict=True)) if executed else [nan] * 8
-        count = max(1, len(executed))
+        sums_ns = (
+            *(observed_ns, observed_ns, sum(map(self.arrived.__getitem__, ticks))),
+            sum(self.begun[number][1] for number in done),
+            *(sum(map(at_ns.__getitem__, done)) for at_ns in (self.left, self.received)),
+            sum(map(self._executed.__getitem__, done)),
+        )
+        count = len(done) or nan
         return {
             f"budget_{name}": (end_ns - begin_ns) / count * 1e-9
             for name, (begin_ns, end_ns) in zip(STAGES, pairwise(sums_ns), strict=True)

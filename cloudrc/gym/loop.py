@@ -487,7 +487,7 @@ class RemoteLoop:
             "ticks": ticks,
             "link": self._chosen.name,
             "link_start": start_ns / 1e9,
-            "loop_age": float(np.mean(self._loop_ages)) * dt if self._loop_ages else nan,
+            "loop_age": sum(ages) / len(ages) * dt if (ages := self._loop_ages) else nan,
             **describe_ages("observation_age", np.array(self._observation_ages) * dt, dt),
             **describe_ages("action_age", actions, dt),
             "age_counts": np.bincount(rounded.astype(int)).tolist(),
