@@ -220,7 +220,7 @@ def _result(found: Assessment) -> Result:
         notes=found.notes,
         config=dump(found.experiment),
         records_sha256=found.records_sha256 or "",
-        flight=found.flight,
+        flight=replace(found.flight, copies=True),
     )
 
 

@@ -39,6 +39,14 @@ def test_a_flight_equals_that_of_the_command(result, tmp_path, call, no_page):
     assert result.applied["horizon"].min() >= 0.0
 
 
+def test_the_tables_of_a_flight_can_be_changed(result):
+    tables = (result.applied, result.flight.truth, result.flight.during("/odometry"))
+    assert all(column.flags.writeable for table in tables for column in table.values())
+    assert not np.shares_memory(
+        result.flight.truth["position"], result["/ground_truth"]["position"]
+    )
+
+
 def test_a_failed_mission_is_a_result():
     with pytest.warns(UserWarning, match="loses 100 %"):
         result = cloudrc.fly("steps", {**SHORT, "link.downlink.loss": 1.0}, seed=1)

@@ -48,6 +48,7 @@ class Flight:
     scene: Scene  # its tubes and all other obstacles
     hull: Spheres | None = None  # of the robot; None: not known
     command_rate_hz: int = 100  # cloud.command_rate_hz
+    copies: bool = False  # whether its tables may be changed: else they are those of the recording
     _during: dict[str, Columns] = field(default_factory=dict, init=False)  # of the topics asked for
 
     @cached_property
@@ -230,7 +231,8 @@ def _joined(recording: Recording, source: type[Record]) -> Columns:
 
 def _flown(flight: Flight, columns: Columns) -> Columns:
     """Select the rows in the time of a flight."""
-    return between(columns, *(flight.span_ns or (0, -1)))
+    found = between(columns, *(flight.span_ns or (0, -1)))
+    return {name: column.copy() for name, column in found.items()} if flight.copies else found
 
 
 def yaw_of(orientations_wxyz: Array) -> Array:
@@ -262,7 +264,11 @@ def select(columns: Columns, rows: Array) -> Columns:
 def between(columns: Columns, first_ns: float, last_ns: float) -> Columns:
     """Select the rows with stamps from `first_ns` to `last_ns` [ns]."""
     stamps_ns = columns["stamp_ns"]
-    return select(columns, (stamps_ns >= first_ns) & (stamps_ns <= last_ns))
+    inside = (stamps_ns >= first_ns) & (stamps_ns <= last_ns)
+    first, count = int(inside.argmax()) if len(inside) else 0, int(np.count_nonzero(inside))
+    if inside[first : first + count].all():  # nearly always: then no column is copied
+        return {name: column[first : first + count] for name, column in columns.items()}
+    return select(columns, inside)
 
 
 Measure: TypeAlias = Callable[[Flight], float | None]

@@ -170,7 +170,7 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> Measured:
                 value = metric.measure(flight)
             else:
                 # A user's metric may change what it is given: it gets tables of its own.
-                own_flight = replace(flight)
+                own_flight = replace(flight, copies=True)
                 with code.apart(), telling_if_slow(f"metric {choice} is still being computed"):
                     value = metric.measure(own_flight)
             if value is None:
