@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import nightly
+from tests.support.camera import needs_renderer
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
@@ -138,7 +139,10 @@ def test_a_command_is_refused_as_the_page_shows(command, printed, folder, monkey
 
 @pytest.mark.usefixtures("numbers_only")
 @pytest.mark.parametrize("is_whole", [False, *nightly(True)])
-@pytest.mark.parametrize("command", FLIGHTS[1:])
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(each, marks=needs_renderer if "follow" in each else ()) for each in FLIGHTS[1:]],
+)
 def test_another_flight_works(command, is_whole, call):
     """By default only the first seconds of it are flown, so that its mission fails."""
     short = [] if is_whole else ["--set", "criteria.time_limit_s=3"]

@@ -60,7 +60,8 @@ def test_a_library_that_kills_its_process_is_told(monkeypatch):
     assert (checks["physics"].state, checks["physics"].found) == ("missing", "exit code -9")
 
 
-@pytest.mark.parametrize("camera", [pytest.param(True, marks=needs_renderer), False])
+@needs_renderer
+@pytest.mark.parametrize("camera", [True, False])
 def test_a_machine_that_renders_is_told(camera):
     checks = {
         check.name: check for check in work.all_checks("local", SimpleNamespace(camera=camera))
