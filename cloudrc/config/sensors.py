@@ -13,25 +13,23 @@ from cloudrc.config.robot import known_robot
 from cloudrc.config.schema import Experiment
 from cloudrc.outside.document import Document
 
+GIVE_SCANNER = "choose the rover, or give its robot.yaml the key scan"
+GIVE_CAMERA = "choose x2, or give its robot.yaml the key camera"
+"""What to do about a robot that lacks a sensor."""
+
 
 def lacks_of(draft: Experiment) -> dict[str, str]:
     """Return sensor -> why a perception cannot take its data, and what to do; "" if it can."""
     name, camera, scan = draft.world.robot, "", ""
     robot = known_robot(name)
     if robot.camera is None:
-        camera = (
-            f"takes pictures, but {name} has no camera: choose another perception or x2, or give "
-            "its robot.yaml the key camera"
-        )
+        camera = f"takes pictures, but {name} has no camera: {GIVE_CAMERA}"
     elif draft.camera is None:
         camera = (
             "takes pictures: give the experiment a section camera, such as camera: {codec: jpeg}"
         )
     if robot.scan is None:
-        scan = (
-            f"takes scans, but {name} has no scanner: choose another perception or the rover, or "
-            "give its robot.yaml the key scan"
-        )
+        scan = f"takes scans, but {name} has no scanner: {GIVE_SCANNER}"
     # With a camera, the scanner works if world.scan says so. Of a section camera without a camera,
     # the check of the whole experiment tells.
     elif draft.camera is not None and robot.camera is not None and not draft.world.scan:
@@ -56,17 +54,11 @@ def of_other_codec(document: Document, experiment: ResolvedExperiment) -> Iterat
 
 
 def without_sensor(experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
-    """List the keys that need a scanner or a camera, if the robot has none."""
-    robot, perception = experiment.world.robot, experiment.cloud.perception
-    if experiment.scans and known_robot(robot).scan is None:
-        path, value = ("world", "scan"), "true"
-        if perception is not None and not experiment.world.scan:
-            path, value = ("cloud", "perception"), perception.name
-        text = f"{robot} has no scanner: choose the rover, or give its robot.yaml the key scan"
-        yield ConfigProblem(path, value, text)
-    if experiment.camera is not None and known_robot(robot).camera is None:
-        text = (
-            f"{robot} has no camera: leave camera out, choose x2, or give its robot.yaml the key "
-            "camera"
-        )
+    """List the keys that ask a robot for a scanner or a camera which it has not."""
+    name = experiment.world.robot
+    robot = known_robot(name)
+    if experiment.world.scan and robot.scan is None:
+        yield ConfigProblem(("world", "scan"), "true", f"{name} has no scanner: {GIVE_SCANNER}")
+    if experiment.camera is not None and robot.camera is None:
+        text = f"{name} has no camera: leave camera out, {GIVE_CAMERA}"
         yield ConfigProblem(("camera",), experiment.camera.codec, text)
