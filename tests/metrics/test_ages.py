@@ -2,9 +2,11 @@
 
 """Ages at the actuator: computed by hand, and step by step."""
 
+import numpy as np
 import pytest
 
 from cloudrc.messages import ZERO, GuardState
+from cloudrc.metrics.flight import between
 from cloudrc.records import CommandApplied, GuardChange, MissionEvent
 from tests.metrics.conftest import Log, at, measured
 
@@ -61,3 +63,12 @@ def test_without_a_limit_or_a_command_there_are_no_such_numbers():
     assert measured(flight(APPLIED, 1.0), "age_violation") is None
     for name in ("age_violation", "peak_age_mean"):
         assert measured(flight([], 1.0, limit=0.1), name) is None
+
+
+@pytest.mark.parametrize("stamps", [[1, 2, 3, 4, 5], [4, 1, 5, 2, 3], [9, 9], []])
+def test_the_rows_of_a_time_are_all_of_them_also_if_they_do_not_follow_each_other(stamps):
+    stamps_ns = np.array(stamps, np.int64)
+    found = between({"stamp_ns": stamps_ns, "value": 10 * stamps_ns}, 2, 4)
+    wanted = [each for each in stamps if 2 <= each <= 4]
+    assert found["stamp_ns"].tolist() == wanted
+    assert found["value"].tolist() == [10 * each for each in wanted]
