@@ -43,7 +43,9 @@ def without_contacts(model: Any, sensors: set[int]) -> Any:
     free = copy(model)
     free.opt.disableflags |= UNUSED_WITHOUT_CONTACTS
     touch = model.sensor_adr[model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH]
-    if not sensors <= {*touch.tolist()}:
+    if sensors <= {*touch.tolist()}:
+        free.body_geomnum[:] = 0  # only contacts and sensors need poses of geoms
+    else:
         free.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
     return free
 

@@ -27,6 +27,7 @@ from cloudrc.robots.pelican.onboard import accelerator
 from cloudrc.robots.pelican.twin import PelicanTwin
 from cloudrc.runs.flight import fly_in_memory
 from cloudrc.sim.engine import mujoco
+from cloudrc.sim.memory import without_contacts
 from cloudrc.sim.onboard import Accelerator, Direct
 from cloudrc.sim.simulator import Simulator
 from cloudrc.tunnel.end import Identity
@@ -256,6 +257,20 @@ def test_where_c_looks_for_no_contact_there_is_none(kind):
         free += is_free
         assert not (is_free and data.ncon)
     assert 300 < free < 2900
+
+
+@pytest.mark.parametrize("of_user", [False, True])
+def test_without_contacts_geoms_have_poses_only_for_a_sensor(of_user):
+    model = model_of("pelican")
+    data = mujoco.MjData(model)
+    touch = int(model.sensor_adr[0])
+    free = without_contacts(model, {touch, touch + 1} if of_user else {touch})
+    mujoco.mj_forward(model, data)
+    before = data.geom_xpos.copy()
+    for _ in range(5):
+        mujoco.mj_step(free, data)
+    assert data.qpos[2] < before[:, 2].max()
+    assert np.array_equal(data.geom_xpos, before) is not of_user
 
 
 def test_in_air_that_acts_on_geoms_c_uses_the_whole_model():
