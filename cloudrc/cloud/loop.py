@@ -22,8 +22,9 @@ from collections import Counter, deque
 from collections.abc import Callable
 from copy import copy, deepcopy
 from functools import lru_cache
+from itertools import chain
 from math import nan
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.cloud.controllers import STAND_STILL, Controller, ControlOutput
 from cloudrc.cloud.controllers.pid import Law, Pid
@@ -32,7 +33,14 @@ from cloudrc.cloud.motion import Body, pack_goal
 from cloudrc.cloud.news import SendOnDelta
 from cloudrc.cloud.plan_log import PlanLog
 from cloudrc.cloud.predictors import Predictor
-from cloudrc.cloud.results import check_estimate, check_output, is_ours, to_vector, to_vectors
+from cloudrc.cloud.results import (
+    check_estimate,
+    check_output,
+    is_ours,
+    to_rows,
+    to_vector,
+    to_vectors,
+)
 from cloudrc.errors import ControllerLostError, describe_error
 from cloudrc.messages import (
     FRESH_ECHO_PERIODS,
@@ -51,6 +59,10 @@ from cloudrc.outside.values import RESULT, InvalidValueError
 from cloudrc.records import UNSENT, Control, Fault
 from cloudrc.teleop.carrot import path_of
 from cloudrc.tunnel.codec import as_planned
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 PERIOD_NS = 10_000_000
 """Time between two commands, unless an experiment sets another rate [ns].
@@ -80,13 +92,16 @@ Source: docs/reference/faults.md, "F23"."""
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
-def _possible(velocities: list[Vector]) -> list[Vector]:
-    """Return the velocities [m/s] before the first one that the guard takes in no plan."""
-    most = PLANNED_MAX
-    for number, (x, y, z) in enumerate(velocities):
-        if not (abs(x) <= most and abs(y) <= most and abs(z) <= most):
-            return velocities[:number]
-    return velocities
+def _possible(velocities: NDArray[np.float64]) -> list[float]:
+    """Return the numbers of the velocities before the first one that the guard takes in no plan.
+
+    `velocities` have the shape (n, 3) [m/s].
+    """
+    numbers = velocities.ravel()
+    too_large = abs(numbers) > PLANNED_MAX
+    count = int(too_large.argmax()) // 3 * 3 if too_large.any() else len(numbers)
+    found: list[float] = numbers[:count].tolist()
+    return found
 
 
 class ControlLoop:
@@ -387,10 +402,11 @@ class ControlLoop:
                 self._echoed_ns = now_ns  # without a command, there is no echo to wait for
                 return None, [], []
             velocities, positions, yaw_rate = made
-            command, *rest = to_vectors(velocities[: self._planned + 1], "planned velocities")
-            self._output = output = ControlOutput(command, RESULT.of(yaw_rate, "yaw rate"))
+            rows = to_rows(velocities[: self._planned + 1], "planned velocities")
+            x, y, z = rows[0].tolist()
+            self._output = output = ControlOutput((x, y, z), RESULT.of(yaw_rate, "yaw rate"))
             positions = to_vectors(positions[: self._planned], "planned positions")
-            return output, as_planned(_possible(rest)), positions
+            return output, as_planned(_possible(rows[1:])), positions
         except FAILURES as error:
             self.note_failure(plug_in, error, INSTEAD["controller"])
             return STAND_STILL, [], []
@@ -440,7 +456,7 @@ class ControlLoop:
         except FAILURES as error:
             self.note_failure(plug_in, error, "cloud sends this command without a plan")
             return [], []
-        return as_planned(plan), positions
+        return as_planned([*chain.from_iterable(plan)]), positions
 
     def _look_ahead(self, setpoint: Setpoint, now_ns: int) -> Setpoint:
         """Set `_later` and `_goal_at` of a setpoint that may move; return it at `now_ns` [ns].

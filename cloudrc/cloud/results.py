@@ -10,11 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import sqrt
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.cloud.controllers import ControlOutput
 from cloudrc.messages import Odometry, Vector
 from cloudrc.outside.values import RESULT, WHOLE, InvalidValueError, shorten
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 SQUARE_TOLERANCE = 0.01
 """Largest deviation from 1 of an orientation's squared length [1]. A smaller one, such as that of a
@@ -76,12 +80,17 @@ def to_vector(numbers: Any, name: str) -> Vector:
     return x, y, z
 
 
-def to_vectors(rows: Any, name: str) -> list[Vector]:
-    """Return rows of three numbers as tuples of floats; `name` names them in the error's text."""
+def to_rows(rows: Any, name: str) -> NDArray[np.float64]:
+    """Return rows of three numbers as an array; `name` names them in the error's text."""
     found = RESULT.array(rows, name)
     if found.shape != (len(rows), 3):
         raise InvalidValueError(f"its {name} have the shape {found.shape}, not (n, 3)")
-    return [(x, y, z) for x, y, z in found.astype(float).tolist()]
+    return found.astype(float)
+
+
+def to_vectors(rows: Any, name: str) -> list[Vector]:
+    """Return rows of three numbers as tuples of floats; `name` names them in the error's text."""
+    return [*zip(*to_rows(rows, name).T.tolist(), strict=True)]
 
 
 def _parts(result: Any) -> Sequence[Any]:

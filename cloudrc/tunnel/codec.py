@@ -13,7 +13,6 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Container, Sequence
 from enum import IntEnum
-from itertools import chain
 from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.messages import (
@@ -223,10 +222,12 @@ def encode_command(command: Command) -> bytes:
     return body + _PLANNED.pack(planned_ns) + b"".join([_VELOCITY.pack(*each) for each in plan])
 
 
-def as_planned(velocities: Sequence[Vector]) -> list[Vector]:
-    """Round velocities [m/s] to single precision, as a plan in a datagram has them."""
-    data = struct.pack(f"<{3 * len(velocities)}f", *chain.from_iterable(velocities))
-    return list(_VELOCITY.iter_unpack(data))
+def as_planned(numbers: Sequence[float]) -> list[Vector]:
+    """Round velocities [m/s] to single precision, as a plan in a datagram has them.
+
+    `numbers` are three of each velocity, one after the other.
+    """
+    return list(_VELOCITY.iter_unpack(struct.pack(f"<{len(numbers)}f", *numbers)))
 
 
 def decode_command(body: bytes) -> Command:

@@ -14,7 +14,7 @@ from tests.flights.conftest import CLOCK, ring
 from tests.support.told import told
 
 COMMAND = Command(1, 2, 3, (0.5, -0.5, 0.25), 0.0)
-PLANNED = COMMAND._replace(plan=(*codec.as_planned([(0.1, 0.0, 0.5)]), ZERO), planned_ns=7)
+PLANNED = COMMAND._replace(plan=(*codec.as_planned((0.1, 0.0, 0.5)), ZERO), planned_ns=7)
 TELEMETRY = told(5).telemetry
 
 

@@ -20,13 +20,13 @@ import numpy as np
 from cloudrc.cloud.controllers import Controller, ControlOutput, Goals, Planned
 from cloudrc.cloud.controllers.pid import GAIN_YAW
 from cloudrc.cloud.motion import Body
-from cloudrc.cloud.predictors import Model
+from cloudrc.cloud.predictors import Model, rotate_ahead
 from cloudrc.cloud.predictors.command_history import Axes, FirstOrder
 from cloudrc.config.robot import RobotFacts
 from cloudrc.config.schema import NotNegative, Positive
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.geometry.vectors import turn_to
-from cloudrc.messages import PLAN_STEP_NS, Odometry, Setpoint, Vector
+from cloudrc.messages import PLAN_STEP_NS, Odometry, Quaternion, Setpoint, Vector
 
 STEP = PLAN_STEP_NS * 1e-9
 """Time between two velocities of a plan [s]."""
@@ -104,25 +104,23 @@ class Mpc(Controller):
 
     def plan(self, model: Model, goals: Goals, dt: float) -> Planned:
         """Compute the velocities from now on; `dt` is the time since the last command [s]."""
-        present = self._present(dt)
-        begin = model.step(present, LOOK)
-        states = np.empty((AHEAD, 6))
-        states[0], states[1:] = (*begin.position, *begin.velocity), _coast(model, present)
+        present, first, yaw_rate = self._present(dt), goals(0.0), 0.0
+        states, orientation = _coast(model, present)
+        if first.turns:
+            yaw_rate = GAIN_YAW * turn_to(first.yaw, orientation)
         positions, velocities = states[:, :3], states[:, 3:]
         wanted, speeds = self._approach(positions[0], goals)
         errors = np.concatenate((wanted - positions, speeds - velocities))
-        changes = self._optimum(errors.T[:, :, None], np.array(present)[:, None])
+        changes, moves = self._optimum(errors.T[:, :, None], np.array(present)[:, None])
         commands = np.empty((2 * AHEAD, 3))
-        commands[:MOVES] = present + np.cumsum(changes, axis=1).T
+        commands[:MOVES] = moves.T
         commands[MOVES:] = commands[MOVES - 1]
         self._last = commands
         positions += (self._position @ changes[:, :, None])[:, :, 0].T
         velocities += (self._velocity @ changes[:, :, None])[:, :, 0].T
-        first = goals(0.0)
-        yaw_rate = first.turns and GAIN_YAW * turn_to(first.yaw, begin.orientation_wxyz)
         every = np.empty((2 * AHEAD, 3))
         every[::2], every[1::2] = positions - STEP * velocities, positions
-        return Planned(commands, every, float(yaw_rate))
+        return Planned(commands, every, yaw_rate)
 
     def _present(self, dt: float) -> Vector:
         """Return the velocity of the last plan after `dt` [s]: the robot follows it now [m/s]."""
@@ -152,24 +150,27 @@ class Mpc(Controller):
         way = away / (distance or 1.0)
         return at + np.array(rests)[:, None] * way, moving - np.array(speeds)[:, None] * way
 
-    def _optimum(self, errors: Any, present: Any) -> Any:
-        """Return the best changes of the command [m/s], shape (3, MOVES).
+    def _optimum(self, errors: Any, present: Any) -> tuple[Any, Any]:
+        """Return the best changes of the command, and the commands [m/s], shapes (3, MOVES).
 
         `errors` are those of the free response in position [m] and velocity [m/s], shape
         (3, 2 AHEAD, 1). `present` is the present command [m/s], shape (3, 1).
         """
         changes = (self._best @ errors)[:, :, 0]
-        commands, most = present + np.cumsum(changes, axis=1), 1.0 + ROUNDING
+        commands, most = present + changes.cumsum(axis=1), 1.0 + ROUNDING
         too_far = abs(commands).max(axis=1) > self._speed * most
         too_fast = abs(changes).max(axis=1) > self._change * most
+        breaks = too_far | too_fast
+        if not breaks.any():
+            return changes, commands
         ones = np.ones(MOVES)
-        for axis in np.flatnonzero(too_far | too_fast).tolist():
+        for axis in breaks.nonzero()[0].tolist():
             most_change, now = self._change * ones, present[axis] * ones
             low = np.concatenate((-most_change, -self._speed - now))
             high = np.concatenate((most_change, self._speed - now))
             cost = self._cost[axis]
             changes[axis] = self._solve(cost, -cost @ changes[axis], self._sums, high, low)[0]
-        return changes
+        return changes, present + changes.cumsum(axis=1)
 
 
 def _where(setpoints: Iterable[Setpoint]) -> tuple[Any, Any]:
@@ -179,12 +180,19 @@ def _where(setpoints: Iterable[Setpoint]) -> tuple[Any, Any]:
     return rows[:, :3], rows[:, 3:]
 
 
-def _coast(model: Model, velocity: Vector) -> Any:
-    """Return the further positions [m] and velocities [m/s] under one command [m/s], in a row."""
+def _coast(model: Model, velocity: Vector) -> tuple[Any, Quaternion]:
+    """Return positions [m] and velocities [m/s] under one command [m/s], shape (AHEAD, 6).
+
+    Also return the orientation in the first of these states.
+    """
     if isinstance(model, Body):
-        return np.frombuffer(model.coast(velocity, LOOK, AHEAD - 1)).reshape(AHEAD - 1, 6)
-    states = (model.step(velocity, LOOK) for _ in range(AHEAD - 1))
-    return [(*state.position, *state.velocity) for state in states]
+        _, _, orientation, _, rate = model.basis
+        orientation = rotate_ahead(orientation, rate, model.horizon + LOOK)
+        states = np.frombuffer(model.coast(velocity, LOOK, AHEAD)).reshape(AHEAD, 6)
+        return states, orientation
+    found = [model.step(velocity, LOOK) for _ in range(AHEAD)]
+    states = np.array([(*state.position, *state.velocity) for state in found])
+    return states, found[0].orientation_wxyz
 
 
 def _responses(axes: Axes) -> Any:
