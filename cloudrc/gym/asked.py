@@ -32,7 +32,7 @@ from cloudrc.link.queue import NOTHING_NS
 from cloudrc.link.streams import sample
 
 PACKETS = 10_000
-"""Least number of packets that the model sends over a time line."""
+"""Least number of packets that the model sends over a time line, and most messages for a mean."""
 PIECES, MESSAGES_MIN = 50_000, 200
 """Number of packets of larger messages that the model sends, and the least number of messages."""
 SETTLED_NS = 100_000_000_000
@@ -85,7 +85,7 @@ def expected(wire: Wire, period: float, count: int = 0) -> tuple[float, float]:
     if wire.is_plain:
         asked = OneWay(profile, 0, wire.asked_uplink).expected(period, wire.size)
         return asked.mean, asked.loss
-    sent_ns = np.arange(count or max(MESSAGES_MIN, PIECES // pieces)) * round(period * 1e9)
+    sent_ns = np.arange(count or _messages(pieces)) * round(period * 1e9)
     delays = _delays_of(wire, sent_ns.tolist(), 0)
     came = delays[np.isfinite(delays)]
     loss = 1.0 - len(came) / len(delays)
@@ -94,6 +94,11 @@ def expected(wire: Wire, period: float, count: int = 0) -> tuple[float, float]:
     if only is not None and not only.blackout:
         loss = 1.0 - (1.0 - profile.corrupt) ** pieces * whole_share(only.loss, pieces)
     return float(came.mean()) if len(came) else nan, loss
+
+
+def _messages(pieces: int) -> int:
+    """Return of how many messages in `pieces` packets a mean is computed."""
+    return min(max(MESSAGES_MIN, PIECES // pieces), PACKETS)
 
 
 def _delays_of(wire: Wire, sent_ns: list[int], episode: int) -> Floats:
@@ -203,7 +208,7 @@ def _shape(distribution: str) -> tuple[float, ...]:
 def _by_model(wire: Wire, timeline: Timeline, period: float) -> Floats:
     """Return mean delay [s] and loss in each piece, of messages that are sent through the model."""
     period_ns, pass_ns = round(period * 1e9), timeline.period_ns
-    least = PACKETS if wire.is_plain else max(MESSAGES_MIN, PIECES // wire.cut.usual)
+    least = PACKETS if wire.is_plain else _messages(wire.cut.usual)
     count = (pass_ns or timeline.pass_ns[-1] + SETTLED * period_ns) // period_ns + 1
     passes = -(-least // count)
     if pass_ns is not None:  # the packets go on from one pass to the next
