@@ -268,9 +268,12 @@ class SignalledFaults:
             self._planned += [(fault.at_s, name, number), (fault.end, name, SIGCONT)]
         self._planned.sort()
 
-    def begin(self, now: float, again: Mapping[str, Callable[[], None]]) -> None:
-        """Begin at `now` [s], monotonic clock; `again` starts the process of a name."""
-        self._origin, self._again = now, again
+    def begin(self, up: float, again: Mapping[str, Callable[[], None]]) -> None:
+        """Count from `up` [s], monotonic clock, when the link came up.
+
+        `again` starts the process of a name.
+        """
+        self._origin, self._again = up, again
 
     def act(self, now: float, children: list[Child]) -> None:
         """Do what is due at `now` [s], monotonic clock, with the running `children`."""

@@ -285,7 +285,8 @@ class LocalRun:
         self._start_teleop(robot)
         self._wait_until_ready()
         # With cloud, which sends first: the time lines of the link begin shortly before the flight.
-        self._start_links(robot, time.monotonic_ns())
+        up_ns = time.monotonic_ns()
+        self._start_links(robot, up_ns)
         if self._remote:
             self._start(robot.folder, CONTROLLER, "policy", "drive", socket=robot.sockets)
             self._wait_until_ready()
@@ -293,7 +294,7 @@ class LocalRun:
         cloud()
         self._wait_until_ready()
         again = {"cloud": cloud, "teleop": partial(self._start_teleop, robot)}
-        self._faults.begin(time.monotonic(), again)
+        self._faults.begin(up_ns * 1e-9, again)
         if session:
             session(robot.url, self._metrics)
         self._watch(limit, robot.sockets)

@@ -136,6 +136,7 @@ def check_delays(recording):
 
 FAULTS = """faults=[
 {kind: cloud_killed, at_s: 4, duration_s: 0.5},
+{kind: partition, at_s: 7, duration_s: 0.5},
 {kind: teleop_killed, at_s: 9, duration_s: 0.5},
 {kind: world_paused, at_s: 12, duration_s: 0.6},
 {kind: cloud_paused, at_s: 14, duration_s: 0.6}]"""
@@ -149,9 +150,10 @@ def test_faults_are_real_signals_and_the_mission_goes_on(tmp_path):
     recording = Recording.read(tmp_path / "run" / "mission.mcap")
     assert recording["/mission"]["event"].tolist() == ["started", "resumed", "reached", "done"]
     assert (recording["/session"]["end"] == "world").sum() == 3, "of cloud, mission, new cloud"
-    sent, guard = recording["/telemetry"], recording["/guard"]
-    held = (guard["stamp_ns"][guard["state"] == GuardState.HOLD] - sent["stamp_ns"][0]) * 1e-9
-    assert held[0] == pytest.approx(4.25, abs=0.3)
+    sent, guard, link = (recording[topic] for topic in ("/telemetry", "/guard", "/link"))
+    up_ns = link["stamp_ns"][0] - link["time_line"][0] * 1e9
+    held = (guard["stamp_ns"][guard["state"] == GuardState.HOLD] - up_ns) * 1e-9
+    assert held[:2].tolist() == pytest.approx([4.25, 7.25], abs=0.3), "all faults count alike"
     assert sent["slip_ns"][-1] * 1e-9 == pytest.approx(0.6, abs=0.15)
     (hole,) = recording.holes
     assert (hole.end_ns - hole.begin_ns) * 1e-9 < 5.0, "the new cloud records"

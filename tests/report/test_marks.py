@@ -10,8 +10,8 @@ import pytest
 
 from cloudrc.config.faults import FaultConfig
 from cloudrc.config.profile import ChangeConfig, DirectionConfig
-from cloudrc.messages import GuardState
-from cloudrc.records import GuardChange, LinkChanged
+from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
+from cloudrc.records import GroundTruth, GuardChange, LinkChanged
 from cloudrc.report.figures.marks import HELD, bounds, legend, mark_events
 from cloudrc.report.figures.style import Subject, new_figure
 from tests.metrics.conftest import ONE_PIPE, at, flown
@@ -56,12 +56,25 @@ def test_holds_are_marked():
     assert (patch.get_x(), patch.get_width()) == pytest.approx((2.0, 1.0))
 
 
-def test_faults_are_marked():
+LINK_STATE = LinkChanged(at(0.5), True, "relay", "", 0.0, 3.25, *(0.0,) * 4, "{}")
+VIRTUAL = GroundTruth(0, Odometry(0, ZERO, UPRIGHT, ZERO, ZERO), ZERO)
+
+
+@pytest.mark.parametrize(
+    ("more", "begin"),
+    [
+        ((), 1.0),  # telemetry began one second before the mission
+        ((LINK_STATE,), 2.0 + 0.5 - 3.25),
+        ((VIRTUAL,), 2.0 - at(0.0) * 1e-9),
+    ],
+)
+def test_faults_are_marked_where_the_link_has_come_up(more, begin):
     fault = FaultConfig(kind="partition", at_s=2.0, duration_s=0.5)
-    subject = replace(subject_of(), faults=(fault,))
+    log = flown()
+    log.world[:0] = more
+    subject = replace(subject_of(log=log), faults=(fault,))
     assert "(partition, 2 to 2.5 s since the link came up)" in legend(subject)
     axes = new_figure(2.0, 3.0).subplots()
     mark_events(axes, subject)
     (patch,) = axes.patches
-    # The link started one second before the mission.
-    assert (patch.get_x(), patch.get_width()) == pytest.approx((1.0, 0.5))
+    assert (patch.get_x(), patch.get_width()) == pytest.approx((begin, 0.5))

@@ -74,10 +74,19 @@ class LinkSpan(NamedTuple):
 
 
 def came_up(subject: Subject) -> float:
-    """Return when the link came up, in seconds since the start of the flight."""
-    flight = subject.flight
-    sent = flight.recording["/telemetry"]["stamp_ns"]
-    return float(flight.seconds(sent[0])) if len(sent) else 0.0
+    """Return when the link came up, in seconds since the start of the flight.
+
+    The processes of a link tell it. In virtual time it comes up at 0 on world's clock, which takes
+    the first sample then. Else telemetry may be the first to cross it.
+    """
+    recording, seconds = subject.flight.recording, subject.flight.seconds
+    link, truth = recording["/link"], recording["/ground_truth"]["stamp_ns"]
+    if len(link):
+        return float(seconds(link["stamp_ns"][0]) - link["time_line"][0]) + subject.link_start
+    if len(truth) and truth[0] == 0:
+        return float(seconds(0))
+    sent = recording["/telemetry"]["stamp_ns"]
+    return float(seconds(sent[0])) if len(sent) else 0.0
 
 
 def parts(subject: Subject, *, uplink: bool) -> list[LinkSpan]:
