@@ -59,6 +59,23 @@ def holds(flight: Flight) -> list[tuple[int, int]]:
     return found if flight.end_ns is None else found + measured.end(flight.end_ns)
 
 
+def came_up(flight: Flight, link_start: float) -> float:
+    """Return when the link came up, in seconds since the start of the mission.
+
+    `link_start` is where its time line began [s]. The processes of a link tell it. In virtual time
+    it comes up at 0 on world's clock, which takes the first sample then. Else telemetry may be the
+    first to cross it.
+    """
+    recording, seconds = flight.recording, flight.seconds
+    link, truth = recording["/link"], recording["/ground_truth"]["stamp_ns"]
+    if len(link):
+        return float(seconds(link["stamp_ns"][0]) - link["time_line"][0]) + link_start
+    if len(truth) and truth[0] == 0:
+        return float(seconds(0))
+    sent = recording["/telemetry"]["stamp_ns"]
+    return float(seconds(sent[0])) if len(sent) else 0.0
+
+
 def reported(flight: Flight) -> dict[int, int]:
     """Return the waypoints that teleop reported as reached: index -> stamp of the report [ns].
 

@@ -20,6 +20,7 @@ from cloudrc.files import read_json, write_atomically, write_json
 from cloudrc.geometry.obstacles import has_surface, obstacles
 from cloudrc.metrics.flight import Flight, select
 from cloudrc.metrics.measure import measure_all
+from cloudrc.metrics.mission import came_up
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import (
@@ -94,6 +95,14 @@ def _remarks(flight: Flight, experiment: ResolvedExperiment) -> Iterator[str]:
             f"{experiment.cloud.horizon_max_s:g} s (cloud.horizon_max_s), and cloud limited it; a "
             "horizon is in seconds."
         )
+    if experiment.faults and flight.end_ns is not None:
+        ended = flight.duration - came_up(flight, link_start(experiment) or 0.0)
+        for fault in experiment.faults:
+            if fault.at_s >= ended:
+                yield (
+                    f"The fault {fault.kind} at {fault.at_s:g} s did nothing: the mission ended "
+                    f"{ended:.1f} s after the link had come up."
+                )
     found = obstacles(scene, touch=flight.mission.touched)
     if flight.hull is None:
         yield f"{UNKNOWN} anything: the size of the robot is not known here."

@@ -104,3 +104,10 @@ def test_a_clock_steps_and_drifts_and_never_goes_back():
         assert clock.at(now_ns - 1) < own_ns <= clock.at(now_ns)
     assert clock.when(5 * SECOND) == 2 * SECOND, "the step jumps over it"
     assert faulty_clock(Clock(), []) == Clock()
+
+
+def test_a_fault_after_the_end_of_the_mission_is_told():
+    in_time, late = (fly(f"kind: clock_step, at_s: {at}, step_s: 3").notes for at in (4, 300))
+    assert not [note for note in in_time if "clock_step" in note]
+    (note,) = [note for note in late if "clock_step" in note]
+    assert note.startswith("The fault clock_step at 300 s did nothing")

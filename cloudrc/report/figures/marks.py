@@ -21,7 +21,7 @@ from cloudrc.link.profile import Timeline
 from cloudrc.link.radio import schedule
 from cloudrc.link.traces import link_profile
 from cloudrc.metrics.flight import Array, rows_of, select
-from cloudrc.metrics.mission import holds
+from cloudrc.metrics.mission import came_up, holds
 from cloudrc.report.figures import style
 from cloudrc.report.figures.style import Subject
 
@@ -73,26 +73,10 @@ class LinkSpan(NamedTuple):
     cause: str  # cause of the change; "" if the link started with this profile
 
 
-def came_up(subject: Subject) -> float:
-    """Return when the link came up, in seconds since the start of the flight.
-
-    The processes of a link tell it. In virtual time it comes up at 0 on world's clock, which takes
-    the first sample then. Else telemetry may be the first to cross it.
-    """
-    recording, seconds = subject.flight.recording, subject.flight.seconds
-    link, truth = recording["/link"], recording["/ground_truth"]["stamp_ns"]
-    if len(link):
-        return float(seconds(link["stamp_ns"][0]) - link["time_line"][0]) + subject.link_start
-    if len(truth) and truth[0] == 0:
-        return float(seconds(0))
-    sent = recording["/telemetry"]["stamp_ns"]
-    return float(seconds(sent[0])) if len(sent) else 0.0
-
-
 def parts(subject: Subject, *, uplink: bool) -> list[LinkSpan]:
     """List the profiles that were in force in one direction of the link, the earliest first."""
     recording, seconds = subject.flight.recording, subject.flight.seconds
-    start, table = came_up(subject), recording["/link"]
+    start, table = came_up(subject.flight, subject.link_start), recording["/link"]
     origin, at_start = start - subject.link_start, subject.uplink if uplink else subject.downlink
     found = [LinkSpan(-inf, origin, at_start, "")]
     ours = select(table.columns, table["uplink"] == uplink)
@@ -156,7 +140,7 @@ def _span(fault: FaultConfig) -> str:
 
 def mark_events(axes: Axes, subject: Subject) -> None:
     """Draw the marks: HOLD and faults shaded, a vertical line for each change of the link."""
-    start = came_up(subject)
+    start = came_up(subject.flight, subject.link_start)
     for fault in subject.faults:
         span = start + fault.at_s, start + fault.end
         edge = 0.0 if fault.length else 1.2  # a step of a clock is a line
