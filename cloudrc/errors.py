@@ -5,6 +5,10 @@
 from __future__ import annotations
 
 import errno
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cloudrc.records import ControllerLost
 
 DISK_FULL = {errno.ENOSPC: "disk full", errno.EDQUOT: "disk quota used up"}
 """Error number (errno) of a full disk -> text for the user."""
@@ -83,10 +87,10 @@ class ControllerLostError(CloudrcError):
 
     exit_code = 5
 
-    def __init__(self, code: str, text: str) -> None:
-        """Set the `code` for programs, one of `records.CONTROLLER_LOST`, and the text for users."""
+    def __init__(self, code: ControllerLost, text: str) -> None:
+        """Set the `code` for programs, and the text for users."""
         super().__init__(code, text)  # pickle passes these arguments to the parent process
-        self.code = code
+        self.code: ControllerLost = code
 
     def __str__(self) -> str:
         return str(self.args[1])

@@ -403,10 +403,37 @@ MissionState: TypeAlias = Literal[
 ControllerLost: TypeAlias = Literal["controller_silent", "controller_invalid"]
 """Codes of faults with which a flight ends, because a program outside that controls the robot does
 not answer, or its answers are wrong."""
+PlugInKind: TypeAlias = Literal["estimator", "predictor", "controller", "perception"]
+"""Kinds of plug-ins in cloud."""
+PlugInFailed: TypeAlias = Literal[
+    "estimator_failed", "predictor_failed", "controller_failed", "perception_failed"
+]
+"""Codes of faults of plug-ins in cloud, in the order of their kinds."""
+FaultCode: TypeAlias = Literal[
+    PlugInFailed,
+    "onboard_failed",
+    ControllerLost,
+    "controller_unstamped",
+    "no_session",
+    "busy",
+    "version",
+    "key",
+    "late",
+    "link",
+    "recorder",
+    "journal",
+    "teleop_silent",
+    "supervisor",
+    "wall_clock",
+]
+"""Codes of faults."""
 BY_HAND: tuple[ByHand, ...] = get_args(ByHand)
 UNDER_WAY: tuple[UnderWay, ...] = get_args(UnderWay)
 FAILURES: tuple[MissionFailure, ...] = get_args(MissionFailure)
 CONTROLLER_LOST: tuple[ControllerLost, ...] = get_args(ControllerLost)
+PLUG_IN_FAILED: dict[PlugInKind, PlugInFailed] = dict(
+    zip(get_args(PlugInKind), get_args(PlugInFailed), strict=True)
+)
 
 
 class MissionEvent(NamedTuple):
@@ -429,17 +456,11 @@ class MissionEvent(NamedTuple):
 class Fault(NamedTuple):
     """Made by world or cloud: a problem that did not stop the flight. Topic /fault.
 
-    The code is one word, such as "predictor_failed", "recorder", "link_check", or "late" (cloud
-    missed periods, or world is slower than real time).
+    The code "late" means that cloud missed periods, or that world is slower than real time.
     """
 
     stamp_ns: int
-    code: Annotated[
-        str,
-        "",
-        "one word, for example estimator_failed, predictor_failed, controller_failed, "
-        f"onboard_failed, {', '.join(CONTROLLER_LOST)}, recorder, link_check, wall_clock, late",
-    ]
+    code: Annotated[FaultCode, "", ", ".join(get_args(FaultCode))]
     text: Annotated[str, "", "what is wrong, where, what to do"]
     traceback: Annotated[str, "", "of a plug-in's first failure, else empty"] = ""
 

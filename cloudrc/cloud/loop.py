@@ -56,7 +56,7 @@ from cloudrc.messages import (
 )
 from cloudrc.outside.code import FAILURES, calling, check_failure, locate, stack_of
 from cloudrc.outside.values import RESULT, InvalidValueError
-from cloudrc.records import UNSENT, Control, Fault
+from cloudrc.records import PLUG_IN_FAILED, UNSENT, Control, Fault, PlugInKind
 from cloudrc.teleop.carrot import path_of
 from cloudrc.tunnel.codec import as_planned
 
@@ -391,7 +391,8 @@ class ControlLoop:
         Return None if the predictor has no model. If the controller plans nothing, the command is
         None. `now_ns` is the time of the command [ns], cloud's clock, `dt` that since the last [s].
         """
-        later, plug_in = self._later, "predictor"
+        later = self._later
+        plug_in: PlugInKind = "predictor"
         try:
             model = self._predictor.model()
             if model is None:
@@ -423,7 +424,8 @@ class ControlLoop:
             was computed. The plan ends before the first velocity that the guard rejects. It is
             empty if the predictor has no model, or if a plug-in fails.
         """
-        plan, positions, plug_in, most = list[Vector](), list[Vector](), "predictor", PLANNED_MAX
+        plan, positions, most = list[Vector](), list[Vector](), PLANNED_MAX
+        plug_in: PlugInKind = "predictor"
         try:
             model = self._predictor.model()
             if model is None:
@@ -469,14 +471,14 @@ class ControlLoop:
             self._goal_at = remember(lambda now_ns: pack_goal(later(now_ns)))
         return setpoint if setpoint.motion is None else self._later(now_ns)
 
-    def _call(self, kind: str, call: Callable[..., None], *arguments: Any) -> None:
+    def _call(self, kind: PlugInKind, call: Callable[..., None], *arguments: Any) -> None:
         """Call a plug-in's method that has no result; count and report an exception."""
         try:
             call(*arguments)
         except FAILURES as error:
             self.note_failure(kind, error, GOES_ON)
 
-    def note_failure(self, kind: str, error: BaseException, instead: str = "") -> None:
+    def note_failure(self, kind: PlugInKind, error: BaseException, instead: str = "") -> None:
         """Count a failure of the plug-in `kind`, such as "estimator"; report a mission's first one.
 
         `instead` tells the user what cloud does now; "" stands for the text in `INSTEAD`.
@@ -485,7 +487,7 @@ class ControlLoop:
             BaseException: `error`, if it is not the plug-in's failure.
         """
         check_failure(error, f"cloud.{kind}")
-        code = f"{kind}_failed"
+        code = PLUG_IN_FAILED[kind]
         self.counts[code] += 1
         if code not in self._reported:
             self._reported.add(code)

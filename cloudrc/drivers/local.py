@@ -285,8 +285,7 @@ class LocalRun:
         self._start_teleop(robot)
         self._wait_until_ready()
         # With cloud, which sends first: the time lines of the link begin shortly before the flight.
-        up_ns = time.monotonic_ns()
-        self._start_links(robot, up_ns)
+        self._start_links(robot, up_ns := time.monotonic_ns())
         if self._remote:
             self._start(robot.folder, CONTROLLER, "policy", "drive", socket=robot.sockets)
             self._wait_until_ready()

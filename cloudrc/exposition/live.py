@@ -12,7 +12,7 @@ import json
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from math import nan
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, get_args
 
 from cloudrc.exposition import table
 from cloudrc.exposition.parts import Histogram, Readings, samples
@@ -61,7 +61,7 @@ ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total"
 """Metrics that only relay or only netem has; without a count they are left out."""
 
 
-CLOCK_SET = "wall_clock"
+CLOCK_SET: Final = "wall_clock"
 """Fault code for a step of the wall clock."""
 SILENCE_NS = 2_000_000_000
 """Time without a new datagram from the peer after which the peer counts as disconnected [ns]."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cloudrc.messages import Command, Datagram, FramePiece, Passed, RangeScan, Telemetry
-from cloudrc.records import Fault, Record
+from cloudrc.records import Fault, FaultCode, Record
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import ReceiveWindow
 from cloudrc.tunnel.codec import (
@@ -78,7 +78,7 @@ class TunnelEnd:
         records, self._records = self._records, []
         return records
 
-    def _tell(self, code: str, text: str, now_ns: int, trace: str = "") -> None:
+    def _tell(self, code: FaultCode, text: str, now_ns: int, trace: str = "") -> None:
         """Record a fault at `now_ns` [ns], unless this session has a fault with the same text.
 
         `trace` is the stack of a plug-in's failure.

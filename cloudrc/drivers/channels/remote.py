@@ -25,6 +25,7 @@ from cloudrc.drivers.openpi.client import PolicyClient, SilentServerError
 from cloudrc.drivers.openpi.codec import pack, unpack
 from cloudrc.drivers.teleop import UnixDatagrams
 from cloudrc.errors import CloudrcError, ControllerLostError
+from cloudrc.records import CONTROLLER_LOST
 
 WIDTH = 4
 """Numbers of a row: vx, vy, vz [m/s], yaw rate [rad/s]."""
@@ -48,8 +49,8 @@ RETRY_PERIOD = 0.05
 """Time between two attempts to reach a program that is gone [s]."""
 WAKE = 0.1
 """Longest time for which the driver waits for a datagram [s]."""
-SILENT, INVALID = "controller_silent", "controller_invalid"
-"""Codes of a lost controller; those of `records.CONTROLLER_LOST`."""
+SILENT, INVALID = CONTROLLER_LOST
+"""Codes of a lost controller."""
 
 
 def check() -> None:
