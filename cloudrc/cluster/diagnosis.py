@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 from cloudrc.cluster.client import COMPONENTS, Release
 from cloudrc.cluster.pods import (
     VALUES,
+    Finding,
     container_statuses,
     describe_end,
     pod_failure,
@@ -62,21 +63,6 @@ UPLINK, DOWNLINK = ("world", "cloud", "uplink"), ("cloud", "world", "downlink")
 """Sender, receiver and name of each direction."""
 
 
-class Finding(NamedTuple):
-    """What is known about one thing, and how to solve a problem.
-
-    "missing" stops an install or a flight, "warn" does not.
-    """
-
-    name: str
-    state: Literal["ok", "warn", "missing"]
-    found: str
-    fix: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.found}; {self.fix}" if self.fix else self.found
-
-
 class Objects(NamedTuple):
     """What the API server has of a release."""
 
@@ -100,23 +86,24 @@ def remedy(words: str, otherwise: str = "") -> str:
     return next((text for part, text in REMEDIES.items() if part in words), otherwise)
 
 
-def why_not_ready(objects: Objects, component: str) -> tuple[str, bool]:
-    """Return why a component is not ready ("" if ready), and whether it can never be ready."""
+def why_not_ready(objects: Objects, component: str) -> Finding | None:
+    """Return why a component is not ready; None if it is. "missing": it can never be ready."""
+    name = f"{component} pod"
     workload, found = objects.workloads[component], objects.pods[component]
     for condition in workload.status.conditions or []:  # for example Pod Security or a quota
         if condition.type == "ReplicaFailure" and condition.status == "True":
-            return to_one_line(condition.message), True
+            return Finding(name, "missing", to_one_line(condition.message))
     for pod in found:
         if why := pod_failure(pod):
-            return why, True
+            return why._replace(state="missing")
     status, wanted = workload.status, workload.spec.replicas
     if len(found) < wanted and (denied := objects.said(workload, "FailedCreate")):
-        return denied[-1], False  # of a StatefulSet, which has no such condition
+        return Finding(name, "warn", denied[-1])  # of a StatefulSet, which has no such condition
     is_observed = (status.observed_generation or 0) >= workload.metadata.generation
     if not (is_observed and len(found) >= wanted == status.updated_replicas == status.replicas):
-        return "its pod is being created", False
+        return Finding(name, "warn", "its pod is being created")
     states = (_pod_state(objects, pod) for pod in found[:wanted])
-    return next((state for state in states if state[0]), ("", False))
+    return next(filter(None, states), None)
 
 
 def is_ready(pod: Any) -> bool:
@@ -126,20 +113,23 @@ def is_ready(pod: Any) -> bool:
     )
 
 
-def _pod_state(objects: Objects, pod: Any) -> tuple[str, bool]:
-    """Return why a pod is not ready ("" if ready), and whether it can never be ready."""
+def _pod_state(objects: Objects, pod: Any) -> Finding | None:
+    """Return why a pod is not ready; None if it is. "missing": it can never be ready."""
+    name = pod.metadata.name
     if is_ready(pod):
-        return "", False
+        return None
     if pod.status.phase == "Pending":
         if failed := [*objects.said(pod, "FailedMount"), *_claims_wait(objects, pod)]:
-            return failed[-1], any(words in failed[-1] for words in MISSING)
+            is_fatal = any(words in failed[-1] for words in MISSING)
+            return Finding(name, "missing" if is_fatal else "warn", failed[-1])
     waiting = [each.name for each in container_statuses(pod) if not each.ready]
     if waiting:
-        return f"container {' and '.join(waiting)} is not ready yet", False
+        return Finding(name, "warn", f"container {' and '.join(waiting)} is not ready yet")
     if pod.status.phase == "Pending":
-        return "it starts", False
+        return Finding(name, "warn", "it starts")
     # Kubernetes, not the kubelet, has taken the readiness from a pod whose containers are ready.
-    return f"its node '{pod.spec.node_name}' does not answer, see: kubectl get nodes", False
+    text = f"its node '{pod.spec.node_name}' does not answer, see: kubectl get nodes"
+    return Finding(name, "warn", text)
 
 
 def _claims_wait(objects: Objects, pod: Any) -> Iterator[str]:
@@ -185,14 +175,12 @@ def diagnose(
         if ends := [*_ends(release, objects, component)]:
             found += ends
             continue
-        why, is_fatal = why_not_ready(objects, component)
-        if fix := remedy(why):
-            is_fatal = True  # it needs a person, even if Kubernetes tries again
-        elif "; " in why:
-            why, _, fix = why.partition("; ")
-        if why:
+        if why := why_not_ready(objects, component):
+            if fix := remedy(str(why)):  # it needs a person, even if Kubernetes tries again
+                why = Finding(name, "missing", str(why), fix)
+            is_fatal = why.state == "missing"
             verb = "cannot run" if is_fatal else "waits"
-            one = Finding(name, "missing", f"the {name} {verb}: {why}", fix or see)
+            one = Finding(name, "missing", f"the {name} {verb}: {why.found}", why.fix or see)
             (found if is_fatal else waits).append(one)
     if unresolved:
         text = f"the link of {' and of '.join(unresolved)} cannot resolve the name of the other end"

@@ -121,9 +121,9 @@ def _why_not_ready(release: Release) -> tuple[str, str]:
     """Say why the pods of a release are not ready, and why they will never be; "" if not so."""
     words, never, objects = list[str](), list[str](), observe(release)
     for component in objects.workloads:
-        why, is_fatal = why_not_ready(objects, component)
-        words += [f"{component}: {why}"] * bool(why)
-        never += [f"the {component} pod cannot run: {why}"] * is_fatal
+        if why := why_not_ready(objects, component):
+            words.append(f"{component}: {why}")
+            never += [f"the {component} pod cannot run: {why}"] * (why.state == "missing")
     return "; ".join(words), "; ".join(never)
 
 

@@ -12,7 +12,6 @@ from typing import Any
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, run
 from cloudrc.cluster.diagnosis import (
     LOOK_UP,
-    Finding,
     Objects,
     diagnose,
     ended_containers,
@@ -21,6 +20,7 @@ from cloudrc.cluster.diagnosis import (
 )
 from cloudrc.cluster.pods import (
     INDEX,
+    Finding,
     container_statuses,
     list_pods,
     read_page,

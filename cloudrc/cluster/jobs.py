@@ -22,7 +22,7 @@ import yaml
 from cloudrc.cluster.client import ClusterError, NotFoundError, Release, chart_folder
 from cloudrc.cluster.incidents import ReleaseWatch
 from cloudrc.cluster.pods import (
-    UNSCHEDULED,
+    Finding,
     PodWatch,
     container_statuses,
     describe_end,
@@ -383,13 +383,13 @@ def why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
 
     Raise a ClusterError if a pod will never run, or if the cluster denies the pods.
     """
+    name = job.metadata.name
     found = [pod_failure(pod) for pod in pods if pod.status.phase == "Pending"]
     if not pods:  # the cluster may deny them, for example for a quota
-        found = events_of(release, job, "FailedCreate")
-    name = job.metadata.name
-    for why in found:
-        never = not why.startswith(UNSCHEDULED) or NO_CLAIM.search(why)
-        if why and never:
+        denied = events_of(release, job, "FailedCreate")
+        found = [Finding(name, "missing", text) for text in denied if text]
+    for why in filter(None, found):
+        if why.state == "missing" or NO_CLAIM.search(why.found):
             raise ClusterError(
                 f"Job '{name}' cannot start: {why}; fix this, then delete the Job: "
                 f"{release.kubectl} delete job {name}"

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from http.client import HTTPConnection
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal, NamedTuple
 
 from cloudrc.cluster.client import (
     REQUEST_TIMEOUT,
@@ -46,8 +46,6 @@ VALUES = {
     "bridge": "ros",
 }
 """Container -> section of the chart's values with its resources, if it has another name."""
-UNSCHEDULED = "no node takes it"
-"""Beginning of the text about a pod that waits for a node."""
 RESTARTS_MAX = 2
 """Largest number of restarts after which a container is still expected to start."""
 TOKENS, OPERATOR = "tokens", "operator"
@@ -75,6 +73,21 @@ LOOK_PERIOD = 0.05
 FORWARDER = "Kubernetes port forward proxy"
 """Beginning of the name of the thread of the Kubernetes client that forwards a port."""
 _FORWARDING = re.compile(rb"Forwarding from 127\.0\.0\.1:(\d+) -> (\d+)")
+
+
+class Finding(NamedTuple):
+    """What is known about one thing, and how to solve a problem.
+
+    "missing" stops an install or a flight, "warn" does not.
+    """
+
+    name: str
+    state: Literal["ok", "warn", "missing"]
+    found: str
+    fix: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.found}; {self.fix}" if self.fix else self.found
 
 
 class NotRunningError(ClusterError):
@@ -188,8 +201,8 @@ def has_container(pod: Any, name: str) -> bool:
     return name in {container.name for container in pod.spec.containers}
 
 
-def pod_failure(pod: Any) -> str:
-    """Describe in one sentence why a pod will never run; return "" if the pod may run."""
+def pod_failure(pod: Any) -> Finding | None:
+    """Return why a pod cannot run; None if it may run. "warn": it can if a node takes it."""
     for status in container_statuses(pod):
         if failure := _container_failure(status):
             return failure
@@ -198,26 +211,29 @@ def pod_failure(pod: Any) -> str:
         # Kubernetes makes some volumes only on first use.
         waits_for_volume = "volume" in message and "unbound" in message
         if (condition.type, condition.status) == ("PodScheduled", "False") and not waits_for_volume:
-            return f"{UNSCHEDULED}: {message}"
-    return ""
+            return Finding(pod.metadata.name, "warn", f"no node takes it: {message}")
+    return None
 
 
-def _container_failure(status: Any) -> str:
-    """Describe in one sentence why a container will never run; return "" if it may run."""
+def _container_failure(status: Any) -> Finding | None:
+    """Return why a container will never run; None if it may run."""
     waiting, ended = status.state.waiting, status.last_state and status.last_state.terminated
     reason, container = waiting.reason if waiting else "", f"container '{status.name}'"
     if reason in NO_IMAGE:
-        return (
-            f"the image {status.image} of {container} is not on the node and cannot be pulled "
-            f"({reason}); name one that the nodes can pull: --set image.registry=... "
-            "--set image.tag=... (a sweep: --image), or load your own into kind: make kind-load"
+        text = f"the image {status.image} of {container} is not on the node and cannot be pulled"
+        fix = (
+            "name one that the nodes can pull: --set image.registry=... --set image.tag=... "
+            "(a sweep: --image), or load your own into kind: make kind-load"
         )
+        return Finding(container, "missing", f"{text} ({reason})", fix)
     if reason in NOT_MADE:
-        return f"{container} cannot be created: {to_one_line(waiting.message)}"
+        text = f"{container} cannot be created: {to_one_line(waiting.message)}"
+        return Finding(container, "missing", text)
     if reason in CRASHES or (status.restart_count or 0) > RESTARTS_MAX:
         end = f": it {describe_end(status.name, ended)}" if ended else ""
-        return f"{container} ends repeatedly{end}"
-    return ""
+        text, _, fix = end.partition("; ")  # of cloudrc's error, in the log of the pod
+        return Finding(container, "missing", f"{container} ends repeatedly{text}", fix)
+    return None
 
 
 def describe_end(container: str, ended: Any) -> str:

@@ -28,8 +28,8 @@ from cloudrc.cluster.client import (
     chart_folder,
     run,
 )
-from cloudrc.cluster.diagnosis import DNS_REMEDY, LOOK_UP, Finding, remedy
-from cloudrc.cluster.pods import container_statuses, pod_failure
+from cloudrc.cluster.diagnosis import DNS_REMEDY, LOOK_UP, remedy
+from cloudrc.cluster.pods import Finding, container_statuses, pod_failure
 from cloudrc.cluster.releases import COMPONENT
 from cloudrc.errors import CloudrcError, to_one_line
 
@@ -391,7 +391,7 @@ def start_probe(
 
 def _finding(release: Release, node: str, pod: str, until: float) -> Finding:
     """Wait for a probe until the time `until` [s, monotonic]; say what it shows about its node."""
-    name, why = f"node {node}", ""
+    name = f"node {node}"
     while time.monotonic() < until:
         found = release.request("get", "pods", name=pod)
         if found.status.phase == "Succeeded":
@@ -401,9 +401,9 @@ def _finding(release: Release, node: str, pod: str, until: float) -> Finding:
         if found.status.phase == "Failed":
             return _failed_probe(release, name, found)
         if why := pod_failure(found):
-            return Finding(name, "missing", why, "make kind-load, or --set image.registry=...")
+            return Finding(name, "missing", str(why), "make kind-load, or --set image.registry=...")
         time.sleep(LOOK_PERIOD)
-    return Finding(name, "warn", why or "its probe has not ended", "kubectl get events")
+    return Finding(name, "warn", "its probe has not ended", "kubectl get events")
 
 
 def _failed_probe(release: Release, node: str, pod: Any) -> Finding:

@@ -72,6 +72,11 @@ DEAF = {USED % "downlink": 0.0, "cloudrc_ready": 0.0}
         ),
         (
             "pods",
+            unready("cloud-1", "cloud", phase="Pending", conditions=unscheduled("1 full; 2 gone")),
+            "cannot run: no node takes it: 1 full; 2 gone; see: kubectl .* describe pods",
+        ),
+        (
+            "pods",
             unready("cloud-1", "cloud", **CRASHES),
             "was killed, because .*; helm upgrade .*cloud.resources.limits.memory=SIZE",
         ),

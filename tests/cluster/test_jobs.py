@@ -6,8 +6,10 @@ import json
 
 import pytest
 
+from cloudrc.cluster import jobs
 from cloudrc.cluster.client import ClusterError
-from cloudrc.cluster.jobs import follow, run_job
+from cloudrc.cluster.jobs import follow, run_job, why_waiting
+from cloudrc.cluster.pods import Finding, list_pods
 from tests.cluster.conftest import MISSION, TOKEN, put_template_and_token, waiting
 
 
@@ -47,6 +49,21 @@ def test_only_the_missions_volume_gets_the_missions_name(running, release):
         "link": "cloudrc-link",
         "own": "mine",
     }
+
+
+@pytest.mark.parametrize(("state", "waits"), [("warn", True), ("missing", False)])
+def test_the_state_of_a_pod_decides_whether_its_job_waits(
+    running, release, monkeypatch, state, waits
+):
+    run_job(release, MISSION, name="first")
+    running.start_pod("first", phase="Pending", ready=False)
+    pods, job = list_pods(release, "mission"), release.request("get", "jobs", name="first")
+    monkeypatch.setattr(jobs, "pod_failure", lambda pod: Finding("pod", state, "any words"))
+    if waits:
+        assert why_waiting(release, job, pods) == "waiting: any words"
+    else:
+        with pytest.raises(ClusterError, match="'first' cannot start: any words; fix this"):
+            why_waiting(release, job, pods)
 
 
 def test_follow_ends_when_the_pod_cannot_run(running, release):

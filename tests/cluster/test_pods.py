@@ -33,7 +33,7 @@ def unscheduled(message):
 )
 def test_a_failure_of_a_pod_is_explained(api, release, given, expected):
     api.put("pods", pod("cloud-1", "cloud", ready=False, phase="Pending", **given))
-    said = pod_failure(list_pods(release, "cloud")[0])
+    said = str(pod_failure(list_pods(release, "cloud")[0]) or "")
     assert re.search(expected, said)
     assert "\n" not in said
 
