@@ -26,7 +26,6 @@ from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Link
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.messages import Datagram, Odometry, Setpoint
-from cloudrc.metrics import measure
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import RESULT
 from cloudrc.record.columns import Recording, RecordStore
@@ -225,9 +224,8 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         recording, run = Recording(records=flight.store), Run("virtual", "virtual")
         own = flight.experiment.report.metrics
         found = assess(recording, flight.experiment, run, own)
-        for note in found.notes:
-            if note.startswith(measure.METRIC_NOTE):
-                warnings.warn(note, stacklevel=3)
+        for note in found.metric_notes:
+            warnings.warn(note, stacklevel=3)
         return {
             "verdict": found.verdict.outcome,
             "failures": [failure.code for failure in found.verdict.failures],

@@ -36,7 +36,7 @@ __all__ += ["budget", "camera", "control", "follow", "link", "mission", "percept
 __all__ += ["response"]
 
 METRIC_NOTE = "metric "
-"""Beginning of a note about a metric."""
+"""Beginning of a note about a metric, by which readers of a stored report know it."""
 
 
 IN_SPITE_OF_HOLES = {

@@ -74,6 +74,7 @@ class Assessment:
     notes: tuple[str, ...]  # sentences for the reader of the report
     records_sha256: str | None  # hash of the recording; None if the recording is incomplete
     traceback: str | None  # of the first failure of a plug-in or a metric, if one failed
+    metric_notes: tuple[str, ...]  # those of `notes` about metrics without a value
 
     @property
     def code(self) -> str | None:

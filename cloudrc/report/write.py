@@ -49,7 +49,7 @@ def assess(
     the experiment names are not executed, because somebody else may have written them.
     """
     flight = flight_of(recording, experiment)
-    numbers, metric_notes, traceback = measure_all(flight, own)
+    numbers, unmeasured, traceback = measure_all(flight, own)
     # A file that is cut short does not tell that the run was interrupted.
     evidence = flight_evidence(
         flight,
@@ -74,11 +74,13 @@ def assess(
                 "From telemetry at the end of the mission, the operator's verdict was "
                 f"{seen.outcome}. The verdict of this report counts."
             )
-    kept = tuple(dict.fromkeys([*notes, *metric_notes]))
+    about = tuple(dict.fromkeys(unmeasured))
+    kept = tuple(dict.fromkeys([*notes, *about]))
     digest = None if recording.note else recording.sha256
     # A plug-in in flight comes before a metric.
     first = next(filter(None, [*recording["/fault"]["traceback"], traceback]), None)
-    return Assessment(run, experiment, flight, numbers, verdict, operator, kept, digest, first)
+    judged = verdict, operator, kept, digest, first
+    return Assessment(run, experiment, flight, numbers, *judged, about)
 
 
 def _remarks(flight: Flight, experiment: ResolvedExperiment) -> Iterator[str]:

@@ -12,7 +12,7 @@ from cloudrc import assembly, plugins
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.time_line import link_start
 from cloudrc.errors import describe_error, machine_error
-from cloudrc.metrics.measure import METRIC_NOTE, SHIPPED, find
+from cloudrc.metrics.measure import SHIPPED, find
 from cloudrc.outside import code
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.record.columns import Recording, RecordStore
@@ -67,11 +67,10 @@ def measure(experiment: ResolvedExperiment) -> Row:
 def row_of(found: Assessment, experiment: ResolvedExperiment) -> Row:
     """Return the row of a flight in virtual time."""
     failures = found.verdict.failures
-    notes = (note for note in found.notes if note.startswith(METRIC_NOTE))
     return {
         "verdict": found.verdict.outcome,
         "failures": [failure.code for failure in failures],
-        "text": "; ".join([*(failure.text for failure in failures[:1]), *notes]),
+        "text": "; ".join([*(failure.text for failure in failures[:1]), *found.metric_notes]),
         "numbers": {name: number.value for name, number in found.numbers.items()},
         "link_start": link_start(experiment),
         "records_sha256": found.records_sha256,
