@@ -22,9 +22,25 @@ TEXT_MAX = 2000
 
 
 class CloudrcError(Exception):
-    """An error that the user can fix; the command exits with `exit_code`."""
+    """An error that the user can fix; the command exits with `exit_code`.
+
+    Its text is `cause` and, where it stands apart, `fix`: what to do.
+    """
 
     exit_code = 1
+
+    def __init__(self, *words: object, fix: str = "") -> None:
+        """Set what is wrong, and what to do about it."""
+        super().__init__(*words)
+        self.fix = fix
+
+    @property
+    def cause(self) -> str:
+        """What is wrong."""
+        return super().__str__()
+
+    def __str__(self) -> str:
+        return f"{self.cause}; {self.fix}" if self.fix else self.cause
 
 
 class BadInputError(CloudrcError):
@@ -66,7 +82,9 @@ class DiskFullError(MissingPrerequisiteError):
         """Set `where`, the file or folder on the full disk."""
         super().__init__(where)  # pickle passes these arguments to the parent process
 
-    def __str__(self) -> str:
+    @property
+    def cause(self) -> str:
+        """What is wrong."""
         return f"disk_full: {self.args[0]}: free some space, or choose another place"
 
 
@@ -92,7 +110,9 @@ class ControllerLostError(CloudrcError):
         super().__init__(code, text)  # pickle passes these arguments to the parent process
         self.code: ControllerLost = code
 
-    def __str__(self) -> str:
+    @property
+    def cause(self) -> str:
+        """What is wrong."""
         return str(self.args[1])
 
 

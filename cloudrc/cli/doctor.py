@@ -44,6 +44,8 @@ WORKS, ENTERED = "MuJoCo loads and steps", "network namespaces, by "
 PICTURES = 20
 """Number of pictures that are rendered to see how long one takes."""
 RENDERS = "of processor time for a picture of 320x240"
+APART = "\t"
+"""What separates cause and remedy in the output of another process of this program."""
 HAS_EGL = "EGL is installed ('cloudrc doctor --camera' says how fast it renders)"
 
 COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
@@ -160,15 +162,18 @@ def step_once() -> None:
 def _enter_namespace() -> None:
     from cloudrc.link.exec import namespace
 
-    way = namespace.enter()
-    namespace.open_device(namespace.ADDRESSES["client"])
-    print(f"{ENTERED}{way}")
+    try:
+        way = namespace.enter()
+        namespace.open_device(namespace.ADDRESSES["client"])
+        print(f"{ENTERED}{way}")
+    except MissingPrerequisiteError as error:
+        print(error.cause, error.fix, sep=APART)
 
 
-def draw() -> None:
+def draw(apart: str = "; ") -> None:
     """Tell how long this machine needs for a picture of x2 in the scene with pipes.
 
-    If it cannot render, tell why, and end this process.
+    If it cannot render, tell why and, after `apart`, what to do; end this process.
     """
     from cloudrc.config.robot import known_robot
     from cloudrc.config.shipped import file_of
@@ -182,7 +187,7 @@ def draw() -> None:
     try:
         camera = Camera(model, at_rest(model), robot.camera)
     except MissingPrerequisiteError as error:
-        print(error)
+        print(*filter(None, (error.cause, error.fix)), sep=apart)
         sys.exit(error.exit_code)
     camera.aim()
     camera.render()
@@ -234,24 +239,25 @@ def _physics(lines: Sequence[str]) -> Iterator[Check]:
 
 def _camera(renders: bool) -> Check:
     """Check whether this machine has what renders a camera's pictures, or `renders` some."""
+    fix = ""
     if renders:  # in a process of its own: a copy of one that has rendered before would hang
-        command = interpreter("-c", "from cloudrc.cli.doctor import draw; draw()")
+        command = interpreter("-c", f"from cloudrc.cli.doctor import draw; draw({APART!r})")
         ended = subprocess.run(command, capture_output=True, text=True)
-        found = (ended.stdout + ended.stderr).strip().rpartition("\n")[2]
+        last = (ended.stdout + ended.stderr).strip().rpartition("\n")[2]
+        found, _, fix = last.partition(APART)
     else:
         try:
             load_egl()
             found = HAS_EGL
         except MissingPrerequisiteError as error:
-            found = str(error)
-    found, _, fix = found.partition("; ")
+            found, fix = error.cause, error.fix
     works = found == HAS_EGL or RENDERS in found
     return _check("camera", works, found, fix)
 
 
 def _namespaces(lines: Sequence[str]) -> Check:
     """Check whether `cloudrc link exec` can make network namespaces here."""
-    found, _, fix = lines[-1].partition("; ")
+    found, _, fix = lines[-1].partition(APART)
     return _check("link exec", found.startswith(ENTERED), found, fix)
 
 
@@ -288,10 +294,8 @@ def _cluster(options: Options) -> Iterator[Check]:
             for finding in survey(release, values):
                 yield Check(*finding, CLUSTER)
     except CloudrcError as error:
-        found, _, fix = str(error).partition("; ")
-        if not fix:
-            fix = FIXES.get(name, MAKE_CLUSTER)
-        yield _check(name, False, found, fix, CLUSTER)
+        fix = error.fix or FIXES.get(name, MAKE_CLUSTER)
+        yield _check(name, False, error.cause, fix, CLUSTER)
 
 
 def as_text(mode: str, checks: Sequence[Check], lacking: Sequence[str]) -> str:

@@ -236,15 +236,15 @@ def connect(
         known, current = contexts()
     except Exception as error:  # the client raises many kinds for a broken kubeconfig
         raise MissingPrerequisiteError(
-            f"no cluster is configured ({' '.join(str(error).split())}); set KUBECONFIG, or make "
-            "a cluster: kind create cluster --config kind-config.yaml"
+            f"no cluster is configured ({' '.join(str(error).split())})",
+            fix="set KUBECONFIG, or make a cluster: kind create cluster --config kind-config.yaml",
         ) from error
     if context is not None:
         by_name = {each["name"]: each for each in known}
         if context not in by_name:
             names = ", ".join(sorted(by_name))
-            text = f"no context '{context}' in the kubeconfig; known: {names}"
-            raise MissingPrerequisiteError(text)
+            text = f"no context '{context}' in the kubeconfig"
+            raise MissingPrerequisiteError(text, fix=f"known: {names}")
         current = by_name[context]
     inherited = (current or {}).get("context", {}).get("namespace")
     return Release(context, namespace or inherited or "default", release)
@@ -266,7 +266,8 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
         yield
     except ApiException as error:
         kind = ERRORS.get(error.status, ClusterError)
-        raise kind(f"cannot {doing} {where}: {_refusal(error, doing)}") from error
+        text, fix = _refusal(error, doing)
+        raise kind(f"cannot {doing} {where}: {text}", fix=fix) from error
     except ValueError as error:  # of the client, which checks an object before it sends it
         words = to_one_line(str(error))
         text = words.partition(" body.")[2].partition(" [type=")[0] or words
@@ -274,29 +275,31 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
     except (HTTPError, OSError) as error:
         why = str(getattr(error, "reason", error)).rpartition(": ")[2]  # after repeated attempts
         text = f"cannot {doing} {where}: the API server does not answer ({why})"
-        raise NoAnswerError(f"{text}; is the cluster up? ask it: kubectl cluster-info") from error
+        fix = "is the cluster up? ask it: kubectl cluster-info"
+        raise NoAnswerError(text, fix=fix) from error
     except ConfigException as error:  # such as a missing certificate file
         raise ClusterError(f"cannot {doing} {where}: {str(error).partition(chr(10))[0]}") from error
 
 
-def _refusal(error: Any, doing: str) -> str:
+def _refusal(error: Any, doing: str) -> tuple[str, str]:
+    """Return why the API server has denied a request, and what to do."""
     try:
         message = json.loads(error.body)["message"]
     except (ValueError, KeyError, TypeError):
         message = error.reason or f"the API server answered {error.status}"
     if error.status == 401:
-        return "the API server does not know you; log in to the cluster again"
+        return "the API server does not know you", "log in to the cluster again"
     message = " ".join(str(message).split())
     is_of_user = " cannot " in message  # not of the object, such as a quota
-    return message + f"; check your permission: kubectl auth can-i {doing}" * is_of_user
+    return message, f"check your permission: kubectl auth can-i {doing}" * is_of_user
 
 
 def program(name: str) -> str:
     """Find a program on the PATH; raise MissingPrerequisiteError if it is missing."""
     path = shutil.which(name)
     if path is None:
-        text = "is not installed; 'cloudrc doctor --mode cluster' says how to install it"
-        raise MissingPrerequisiteError(f"{name} {text}")
+        fix = "'cloudrc doctor --mode cluster' says how to install it"
+        raise MissingPrerequisiteError(f"{name} is not installed", fix=fix)
     return path
 
 
@@ -345,4 +348,6 @@ def chart_folder(package: Path = PACKAGE) -> Path:
     for place in places:
         if (place / "Chart.yaml").is_file():
             return place
-    raise MissingPrerequisiteError(f"the Helm chart is not in {places[0]}; install cloudrc again")
+    raise MissingPrerequisiteError(
+        f"the Helm chart is not in {places[0]}", fix="install cloudrc again"
+    )

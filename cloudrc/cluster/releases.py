@@ -176,6 +176,7 @@ def no_release(release: Release, what: str = "") -> ClusterError:
     """
     what = what or f"no {release}"
     return ClusterError(
-        f"{what}; see all: helm list --all-namespaces; name one: --release NAME -n NAMESPACE, or "
-        "install it: helm install"
+        what,
+        fix="see all: helm list --all-namespaces; name one: --release NAME -n NAMESPACE, or "
+        "install it: helm install",
     )

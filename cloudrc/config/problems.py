@@ -66,7 +66,9 @@ class ProblemsError(BadInputError):
         super().__init__(problems)  # pickle passes these arguments to the parent process
         self.problems = tuple(problems)
 
-    def __str__(self) -> str:
+    @property
+    def cause(self) -> str:
+        """What is wrong."""
         return "; ".join(map(str, self.problems))
 
 

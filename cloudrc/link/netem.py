@@ -37,6 +37,7 @@ from cloudrc.link.draws import PARETO_CUT, Floats
 from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
 
 USE_RELAY = "use the relay (link.mode=relay, or --shaper relay)"
+UNDO = "stop that program, and restart this pod"
 ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"  # root qdisc, band of the tunnel, its netem
 PERIOD_NS = 1_000_000_000  # time between two checks of the qdiscs [ns]
 STEP_NS = 5_000_000  # shortest time between two changes by a time line; faster are skipped [ns]
@@ -81,7 +82,8 @@ def explain(words: Sequence[str], text: str, *, missing: bool = False) -> Cloudr
             "use nodes whose kernel has them ('modprobe -a sch_netem sch_prio cls_u32' there) and "
             "a namespace for privileged pods, or "
         )
-    return MissingPrerequisiteError(f"{cause}; {remedy}{USE_RELAY}, which needs no kernel module")
+    fix = f"{remedy}{USE_RELAY}, which needs no kernel module"
+    return MissingPrerequisiteError(cause, fix=fix)
 
 
 def show(run: Run, *words: str) -> list[dict[str, Any]]:
@@ -185,7 +187,8 @@ def check(profile: DirectionProfile) -> None:
     }
     for what, holds in beyond.items():
         if holds:
-            raise RejectedError(f"netem cannot do {what}; {USE_RELAY}, which can, or leave it out")
+            fix = f"{USE_RELAY}, which can, or leave it out"
+            raise RejectedError(f"netem cannot do {what}", fix=fix)
 
 
 def options(profile: DirectionProfile, conditions: Conditions, room: int) -> list[str]:
@@ -329,7 +332,7 @@ class Netem:
         check(profile)
         held = self._look().get("held", 0)
         if self._damage:
-            raise MissingPrerequisiteError(self._damage)
+            raise MissingPrerequisiteError(self._damage, fix=UNDO)
         before, room = (self._profile, self._origin_ns), self._room
         self._take(profile, self._clock() - start_ns if restart else self._origin_ns)
         if self._room < room:  # netem drops all packets while it holds more than its limit
@@ -390,11 +393,11 @@ class Netem:
             what = f"was changed to {json.dumps(found)}" if found else "was removed"
             said = (
                 f"the qdisc of {self._device} {what} by another program, so the link no longer has "
-                "the requested profile; stop that program, and restart this pod"
+                "the requested profile"
             )
         if said and said != self._damage:
             self._damages += 1
-            self._log(f"error: {said}")
+            self._log(f"error: {said}; {UNDO}")
         self._damage = said
         names = {"forwarded": "packets", "lost": "drops", "held": "qlen"}
         return {name: leaf[key] for name, key in names.items()} if leaf else {}
@@ -406,7 +409,8 @@ class Netem:
         if root["handle"] != "0:" and not _is_ours(root):
             raise MissingPrerequisiteError(
                 f"{self._device} has a qdisc already ({root['kind']} {root['handle']}) that is not "
-                f"cloudrc's; remove it ('tc qdisc del {' '.join(place)}'), or {USE_RELAY}"
+                "cloudrc's",
+                fix=f"remove it ('tc qdisc del {' '.join(place)}'), or {USE_RELAY}",
             )
         if not _is_ours(root):
             self._run(("tc", "qdisc", "add", *place, "handle", ROOT, *_PRIO))

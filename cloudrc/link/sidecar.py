@@ -132,7 +132,7 @@ class Sidecar:
             except CloudrcError as error:
                 if self.mode == "netem":
                     raise
-                self._reason = f"netem does not work here: {_cause(error)}"
+                self._reason = f"netem does not work here: {error.cause}"
         relay = self.relay(profile.direction, self.origin_ns)
         return relay, relay.follow_peer(peer)
 
@@ -143,7 +143,7 @@ class Sidecar:
             shaper.follow_profile(profile.direction, restart=restart, start_ns=start_ns)
         except CloudrcError as error:
             if self.mode == "auto":
-                self.log(f"the shaper changes to the relay: {_cause(error)}")
+                self.log(f"the shaper changes to the relay: {error.cause}")
                 return False
             self.log(f"the new profile is refused, the old one stays: {error}")
             if self.state:
@@ -174,7 +174,3 @@ class Sidecar:
 
     def _publish_route(self, route: Address) -> None:
         write_atomically(self.route, f"{route[0]}:{route[1]}\n".encode())
-
-
-def _cause(error: CloudrcError) -> str:
-    return str(error).partition("; ")[0]

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.sim.egl import NO_EGL
+from cloudrc.sim.egl import INSTALL, NO_EGL
 from cloudrc.sim.engine import mujoco, place_cameras
 from cloudrc.sim.scene import find_camera, is_of_robot
 
@@ -49,7 +49,8 @@ def _open_egl() -> tuple[Any, Callable[[], None], str]:
         context.make_current()
         return context, EGL.eglReleaseThread, GL.glGetString(GL.GL_RENDERER).decode()
     except (ImportError, AttributeError, RuntimeError, OSError, ctypes.ArgumentError) as error:
-        raise MissingPrerequisiteError(NO_EGL.format(" ".join(str(error).split()))) from None
+        text = NO_EGL.format(" ".join(str(error).split()))
+        raise MissingPrerequisiteError(text, fix=INSTALL) from None
 
 
 def _close(context: Any, drawing: Any) -> None:

@@ -9,7 +9,8 @@ import ctypes
 from cloudrc.errors import MissingPrerequisiteError
 
 LIBRARY = "libEGL.so.1"
-NO_EGL = "this machine cannot render ({}); run: apt-get install libegl1 libgl1-mesa-dri libopengl0"
+NO_EGL = "this machine cannot render ({})"
+INSTALL = "run: apt-get install libegl1 libgl1-mesa-dri libopengl0"
 
 
 def load_egl() -> None:
@@ -21,4 +22,4 @@ def load_egl() -> None:
     try:
         ctypes.CDLL(LIBRARY)
     except OSError as error:
-        raise MissingPrerequisiteError(NO_EGL.format(error)) from None
+        raise MissingPrerequisiteError(NO_EGL.format(error), fix=INSTALL) from None

@@ -14,6 +14,7 @@ import pytest
 from cloudrc.cli import doctor as work
 from cloudrc.cli.doctor import Check
 from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.link.exec import namespace
 from cloudrc.runs import requirements
 from cloudrc.sim import egl
 from tests.support.camera import needs_renderer
@@ -75,6 +76,15 @@ def test_a_machine_without_egl_is_told(monkeypatch):
     checks = {check.name: check for check in work.all_checks("local", PLAIN)}
     assert checks["camera"].state == "warn"
     assert checks["camera"].fix.startswith("run: apt-get")
+
+
+def test_a_machine_without_namespaces_is_told_with_the_remedy_of_the_error(monkeypatch):
+    def fail():
+        raise MissingPrerequisiteError("no namespace; none", fix="allow it; or not")
+
+    monkeypatch.setattr(namespace, "enter", fail)
+    check = {each.name: each for each in work.all_checks("local", PLAIN)}["link exec"]
+    assert check[1:4] == ("warn", "no namespace; none", "allow it; or not")
 
 
 def test_the_extras_are_those_of_pyproject():

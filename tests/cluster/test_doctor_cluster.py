@@ -8,6 +8,7 @@ import pytest
 
 from cloudrc.cli import doctor as checks
 from cloudrc.cluster import client
+from cloudrc.cluster.client import ClusterError, Release
 from tests.cluster.conftest import CONFIG_PLACE, kubeconfig
 
 
@@ -40,6 +41,16 @@ def test_a_cluster_elsewhere_does_not_need_kind(api, programs, doctor):
     assert doctor(3, "--context", "x")["kubeconfig"]["state"] == "missing"
     programs.remove("helm")
     assert doctor(3)["helm"]["state"] == "missing"
+
+
+@pytest.mark.parametrize("fix", ["call; or write", ""])
+def test_what_to_do_is_told_by_the_error_and_not_by_its_words(api, doctor, monkeypatch, fix):
+    def fail(*given, **wanted):
+        raise ClusterError("this; and that", fix=fix)
+
+    monkeypatch.setattr(Release, "request", fail)
+    check = doctor(3)["cluster"]
+    assert (check["found"], check["fix"]) == ("this; and that", fix or checks.MAKE_CLUSTER)
 
 
 def test_a_cluster_that_cannot_be_reached_blocks_the_mode(tmp_path, doctor, monkeypatch):

@@ -15,8 +15,8 @@ from cloudrc.link.state import ChangeFacts
 from tests.link.profiles import profile_of
 
 PEER, NEXT = ("10.244.0.7", 7400), ("10.244.0.9", 7400)
-REFUSED = BadInputError("netem cannot do delay_ms above 274000 (far); set link.mode=relay")
-NO_NETEM = MissingPrerequisiteError("this kernel has no sch_netem; set link.mode=relay")
+REFUSED = BadInputError("netem cannot do delay_ms above 274000 (far)", fix="set link.mode=relay")
+NO_NETEM = MissingPrerequisiteError("no sch_netem; no sch_prio", fix="set link.mode=relay")
 
 
 class Shaper:
@@ -137,7 +137,7 @@ def test_auto_takes_netem_where_it_works(tmp_path):
 @pytest.mark.parametrize(
     ("refuses", "reason"),
     [
-        (NO_NETEM, "this kernel has no sch_netem"),
+        (NO_NETEM, "no sch_netem; no sch_prio"),
         (REFUSED, "netem cannot do delay_ms above 274000 (far)"),
     ],
 )

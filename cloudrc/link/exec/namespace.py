@@ -59,7 +59,9 @@ def enter() -> str:
         MissingPrerequisiteError: If the kernel does not allow it; the text says what to allow.
     """
     if not hasattr(os, "memfd_create"):  # Linux alone has it
-        raise MissingPrerequisiteError(f"network namespaces need Linux; use Linux, {OTHERWISE}")
+        raise MissingPrerequisiteError(
+            "network namespaces need Linux", fix=f"use Linux, {OTHERWISE}"
+        )
     try:
         _unshare(_NEWNET)
     except PermissionError:
@@ -101,9 +103,9 @@ def _not_allowed(what: str) -> MissingPrerequisiteError:
         file = Path("/proc/sys", name)
         if file.exists() and file.read_text(encoding="ascii").strip() == bad:
             allow = f"as root: sysctl -w {name.replace('/', '.')}={good}"
-            return MissingPrerequisiteError(f"{what}; {allow}; {OTHERWISE}")
+            return MissingPrerequisiteError(what, fix=f"{allow}; {OTHERWISE}")
     allow = "run as root; in a container allow --cap-add SYS_ADMIN --cap-add NET_ADMIN"
-    return MissingPrerequisiteError(f"{what}; {allow} --device {TUN}; {OTHERWISE}")
+    return MissingPrerequisiteError(what, fix=f"{allow} --device {TUN}; {OTHERWISE}")
 
 
 def open_device(own: Addresses) -> tuple[int, bool]:
@@ -116,12 +118,12 @@ def open_device(own: Addresses) -> tuple[int, bool]:
         device = os.open(TUN, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError:
         raise MissingPrerequisiteError(
-            f"{TUN} is missing; as root: modprobe tun; in a container allow --device {TUN};"
-            f" {OTHERWISE}"
+            f"{TUN} is missing",
+            fix=f"as root: modprobe tun; in a container allow --device {TUN}; {OTHERWISE}",
         ) from None
     except OSError as error:
         raise MissingPrerequisiteError(
-            f"{TUN}: {error.strerror}; as root: chmod 666 {TUN}; {OTHERWISE}"
+            f"{TUN}: {error.strerror}", fix=f"as root: chmod 666 {TUN}; {OTHERWISE}"
         ) from None
     try:
         fcntl.ioctl(
