@@ -94,6 +94,12 @@ def test_no_text_of_the_core_names_a_guest():
     assert named == set()
 
 
+def test_no_remedy_is_cut_out_of_a_sentence():
+    """But of the error in a pod's log, which comes as text."""
+    cut = {place_of(path) for path in FILES if '.partition("; ")' in path.read_text()}
+    assert cut == {"cluster/pods.py"}
+
+
 def test_live_metrics_load_neither_recordings_nor_heavy_libraries():
     heavy = {"cloudrc.record", "cloudrc.config", "pydantic", "numpy"}
     program = f"import sys, cloudrc.exposition.live; print({heavy} & sys.modules.keys())"
