@@ -11,6 +11,7 @@ import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -79,7 +80,7 @@ class _WrongValueError(Exception):
 
 def _section(kind: Any, values: Mapping[str, Any], path: KeyPath) -> Any:
     """Convert a mapping to a class of keys."""
-    hints, made = get_type_hints(kind, include_extras=True), {}
+    hints, made = _hints_of(kind), {}
     for key, value in values.items():
         if key not in hints:
             # `delay` is nearest to `delay_ms`: a forgotten unit is more likely than a typo.
@@ -93,6 +94,11 @@ def _section(kind: Any, values: Mapping[str, Any], path: KeyPath) -> Any:
     if hasattr(keys, "conflict") and (text := keys.conflict()):
         raise _WrongValueError(path, text)
     return keys
+
+
+@cache  # to evaluate the annotations takes longer than all else
+def _hints_of(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
 
 
 def _value(kind: Any, value: Any, path: KeyPath) -> Any:
