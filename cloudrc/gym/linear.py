@@ -74,6 +74,7 @@ class Linear(gymnasium.Env[Floats, Floats]):
         self._r = _matrix("R", R, (inputs, inputs))
         self._w = _root("W", _matrix("W", W, (states, states)))
         self._v = _root("V", _matrix("V", V, (outputs, outputs)))
+        self._is_noisy = bool(self._v.any())
         self._first = ANY.array(x0, "x0").astype(float)
         if self._first.shape not in ((), (states,)):
             raise InvalidValueError(f"x0 has the shape {self._first.shape}, not ({states},)")
@@ -104,7 +105,7 @@ class Linear(gymnasium.Env[Floats, Floats]):
         """Move to the state `x`; return the outputs, and the state for the judge."""
         self._x = x
         seen = self._c @ x
-        if self._v.any():
+        if self._is_noisy:
             seen = seen + self._v @ self.np_random.standard_normal(len(seen))
         return seen, {"x": x.copy()}
 
