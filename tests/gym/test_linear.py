@@ -25,12 +25,19 @@ LIKE_ANOTHER = [
 """Rows that differ from one that is measured daily in a parameter or in a rule."""
 
 
+LONGER = {
+    "P(age > D + 2T)",
+    "Costa 2016: peak age [s]",
+    "Kaul 2012: age, loss .1 [s]",
+    "starvation of `async`, share 0.5, 30 steps late",
+}
+"""Rows whose error is too large in a twentieth of the steps, and those that share its run."""
 DAILY = sorted(ROWS.keys() - {canon.HEAVY, *LIKE_ANOTHER})
 
 
 @pytest.mark.parametrize(
     ("name", "scale"),
-    [(name, 0.1) for name in DAILY]
+    [(name, 0.1 if name in LONGER else 0.05) for name in DAILY]
     + nightly_rows(*[(name, 0.1) for name in LIKE_ANOTHER], *[(name, 1.0) for name in ROWS]),
 )
 def test_a_closed_form_is_measured(name, scale):
