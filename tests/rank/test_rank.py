@@ -13,6 +13,7 @@ from cloudrc.rank import entry as entries
 from cloudrc.rank import play, tasks
 from cloudrc.rank.page import write_page
 from cloudrc.rank.score import in_order, score
+from tests.conftest import nightly_rows
 from tests.support import contrast
 
 FULL = "1" * 50
@@ -102,17 +103,32 @@ def short(monkeypatch):
 
 
 GRID = tuple(each for each in tasks.CONDITIONS if each[0] in (tasks.NONE, tasks.CONSTANT))
+
+
+def some(*rtts):
+    """Return the conditions with these round trips [ms], and that without a network."""
+    return tuple(each for each in GRID if each[1] in (None, *rtts))
+
+
 FEW = ((tasks.NONE, None), (tasks.CONSTANT, 0.0), (tasks.CONSTANT, 50.0), ("wifi", None))
 
 
-@pytest.mark.parametrize(("policy", "words"), [("linear", "100 ms"), ("smith", "600 ms")])
-def test_the_margin_of_the_linear_plant_is_that_of_its_roots(policy, words, short, tmp_path):
+@pytest.mark.parametrize(
+    ("policy", "words", "grid"),
+    [
+        ("linear", "100 ms", some(0.0, 100.0, 150.0)),
+        ("smith", "600 ms", some(600.0)),
+        *nightly_rows(("linear", "100 ms", GRID), ("smith", "600 ms", GRID)),
+    ],
+    ids=lambda each: each if isinstance(each, str) else len(each),
+)
+def test_the_margin_of_the_linear_plant_is_that_of_its_roots(policy, words, grid, short, tmp_path):
     """The plant has no noise, so that all seeds are one."""
     delays = {10: 0.9983, 11: 1.0053}  # steps -> largest root of z^(d+1) - 1.05 z^d + .12
     for steps, size in delays.items():
         roots = np.roots([1.0, -1.05, *[0.0] * (steps - 1), 0.12])
         assert abs(roots).max() == pytest.approx(size, abs=1e-4)
-    short(1, GRID)
+    short(1, grid)
     played = play.Played(tasks.Entrant("linear", policy, "newest"), tmp_path / "entry.json")
     assert played.play(1, None, lambda done: None) is None
     found = played.write()["results"]
@@ -130,7 +146,7 @@ def test_the_predictor_of_the_linear_plant_answers_numbers_over_a_delay_that_var
 
 
 def test_a_repetition_gives_the_same_file_and_shards_give_it_too(call, short, tmp_path):
-    short(2, FEW)
+    short(1, FEW)
     files = [tmp_path / name / "one.json" for name in ("a", "b")]
     for path, parts in zip(files, ([], ["--shard=1/2", "--shard=2/2", ""]), strict=True):
         for part in parts or [""]:
