@@ -21,41 +21,66 @@ from cloudrc.config.task import read_task
 from cloudrc.exercise import checks, scoring
 from cloudrc.exercise.files import SHIPPED, describe_missing
 from cloudrc.exercise.watch import Limits
-from tests.conftest import nightly, wait_until
+from tests.conftest import nightly, nightly_rows, wait_until
 
 SOLUTION = Path(__file__).with_name("solution")
 TASK = read_task(SHIPPED)
+SHORT = {"mission.steps.count": 2}
+"""What a flight of the experiment `steps` needs to tell a wrong part from a right one."""
 FILES = TASK.files
 ALL = {part: [*about.tests] for part, about in TASK.parts.items()}
 STUBS = Path(exercise.__file__).parent
 
 
-def score(part, folder):
+def brief(task):
+    """Return a task whose flights of `steps` are short."""
+    made = task.model_copy(deep=True)
+    for part in made.parts.values():
+        for test in part.tests.values():
+            if test.experiment == "steps":
+                test.set.update(SHORT)
+    return made
+
+
+def score(part, folder, task=TASK):
     """Score a part; the student's functions run in this process."""
-    rows = checks.run(TASK, part, folder, STUBS)
-    tests = TASK.parts[part].tests.items()
+    rows = checks.run(task, part, folder, STUBS)
+    tests = task.parts[part].tests.items()
     return [
         {"test": test, "max_points": about.points, **row}
         for (test, about), row in zip(tests, rows, strict=True)
     ]
 
 
-@pytest.mark.parametrize("part", ALL)
-def test_the_solution_scores_all(part):
-    for row in score(part, SOLUTION):
+@pytest.mark.parametrize(
+    ("part", "task"),
+    [
+        *((part, brief(TASK)) for part in ALL),  # the flights of `together` are no steps
+        *nightly_rows(*((part, TASK) for part in FILES)),
+    ],
+    ids=lambda each: each if isinstance(each, str) else "whole" if each is TASK else "brief",
+)
+def test_the_solution_scores_all(part, task):
+    for row in score(part, SOLUTION, task):
         assert row["points"] == row["max_points"], row
 
 
 @pytest.mark.parametrize("part", sorted(ALL.keys() - {"together"}) + nightly("together"))
 def test_a_stub_scores_nothing(part):
-    assert [row for row in score(part, STUBS) if row["points"]] == []
+    assert [row for row in score(part, STUBS, brief(TASK)) if row["points"]] == []
 
 
 # Part, text of the solution, what a student writes instead, lost tests, text of the first one.
 @pytest.mark.parametrize(
     ("part", "right", "wrong", "lost", "said"),
     [
-        ("estimator", "/ (self.count + 1)", "* 0.05", ["mean", "hold time"], "wrong horizons"),
+        (
+            "estimator",
+            "(self.count + 1)",
+            "(self.count + 2)",
+            ["mean", "hold time"],
+            "wrong horizons",
+        ),
         ("predictor", "horizon):", "horizon)", ALL["predictor"], "predictor.py:7: SyntaxError: "),
         (
             "predictor",
@@ -78,7 +103,7 @@ def test_an_error_costs_the_points_that_it_concerns(part, right, wrong, lost, sa
     text = (SOLUTION / name).read_text()
     assert right in text
     (tmp_path / name).write_text(text.replace(right, wrong))
-    rows = score(part, tmp_path)
+    rows = score(part, tmp_path, brief(TASK))
     less = [row for row in rows if row["points"] < row["max_points"]]
     assert [row["test"] for row in less] == lost, rows
     assert said in less[0]["seen"]
