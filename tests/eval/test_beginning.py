@@ -72,7 +72,8 @@ def test_memory_adds_nothing_to_the_bytes_of_an_observation(law):
 
 
 def test_the_page_counts_episodes_that_tell_of_their_beginning(law, tmp_path, evaluate):
-    words = "--policy", law(), "--rtt", "0,200", "--seeds", 2, "--success-at", 500
+    limit = "--max-steps", 60, "--success-at", 60
+    words = "--policy", law(), "--rtt", "0,200", "--seeds", 2, *limit
     out = "--out", tmp_path / "e", "-o", "json"
     document = json.loads(evaluate(*words, *out).out)
     assert [each["unanswered"] for each in document["outcomes"]] == [0, 0, 2]
@@ -95,9 +96,9 @@ def test_what_cannot_run_is_refused_before_anything_is_written(law, tmp_path, ev
 def test_episodes_without_an_answer_are_told_at_the_beginning_and_on_the_page(
     law, tmp_path, evaluate
 ):
-    words = "--policy", law(), "--seeds", 1, "--max-steps", 250, "--out", tmp_path / "e"
+    words = "--policy", law(), "--seeds", 1, "--max-steps", 100, "--out", tmp_path / "e"
     said = evaluate(*words, "--compute", 20, "--rtt", "0,50,100")
-    assert said.err.count("an answer takes 20 s, an episode 5 s; times are in s") == 1
+    assert said.err.count("an answer takes 20 s, an episode 2 s; times are in s") == 1
     assert "newest at 100 ms: no step gets an answer" in said.out
     said = evaluate(*words, "--executor", "time-indexed,prefix", "--rtt", "0,100,200")
     line = "time-indexed at 100 ms, time-indexed at 200 ms, prefix at 100 ms, prefix at 200 ms: an"

@@ -11,6 +11,7 @@ import pytest
 from cloudrc.errors import BadInputError
 from cloudrc.eval.episode import check_environment
 from cloudrc.eval.setup import EvalSetup
+from tests.conftest import nightly_rows
 
 STILL = "def infer(observation):\n    return {'actions': [[0.0]]}\n"
 
@@ -37,15 +38,17 @@ gymnasium.register("ID", entry_point=My)
 
 
 @pytest.mark.parametrize(
-    ("place", "module", "name", "env"),
+    ("place", "module", "name", "env", "jobs"),
     [
-        ("laws", "beside_env", "Beside-v0", "beside_env:Beside-v0"),
-        pytest.param("elsewhere", "else_env", "space/Else-v0",
-                     "elsewhere/else_env.py:space/Else-v0", marks=pytest.mark.full),
+        ("laws", "beside_env", "Beside-v0", "beside_env:Beside-v0", 1),
+        *nightly_rows(
+            ("laws", "two_env", "Two-v0", "two_env:Two-v0", 2),
+            ("elsewhere", "else_env", "space/Else-v0", "elsewhere/else_env.py:space/Else-v0", 2),
+        ),
     ],
-)  # fmt: skip
+)
 def test_an_environment_may_be_a_file_here_or_beside_the_policy(
-    tmp_path, monkeypatch, call, place, module, name, env
+    tmp_path, monkeypatch, call, place, module, name, env, jobs
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
@@ -54,7 +57,7 @@ def test_an_environment_may_be_a_file_here_or_beside_the_policy(
     Path("laws/law.py").write_text(STILL)
     Path(place, f"{module}.py").write_text(MY_ENV.replace("NAME", module).replace("ID", name))
     Path(place, f"{module}_sizes.py").touch()
-    said = call(f"eval --env {env} --policy laws/law.py --seeds 2 --jobs 2")
+    said = call(f"eval --env {env} --policy laws/law.py --seeds 2 --jobs {jobs}")
     assert "4 episodes, step 0.05 s (control_hz of My)" in said.err
     (folder,) = (each for each in Path("runs").iterdir() if not each.is_symlink())
     assert ":" not in folder.name

@@ -30,7 +30,7 @@ def test_the_episodes_without_a_network_are_the_policys_own_whatever_link_and_ti
 
 
 def test_the_table_is_also_one_of_csv_alone(law, tmp_path, evaluate):
-    words = "--seeds 1 --rtt 0 -o csv --out".split()
+    words = "--seeds 1 --rtt 0 --max-steps 9 -o csv --out".split()
     out = evaluate("--policy", law(), *words, tmp_path / "e").out
     assert out.startswith("rtt_ms,executor,episodes,return,steps,")
     assert "no network" in out
@@ -39,7 +39,7 @@ def test_the_table_is_also_one_of_csv_alone(law, tmp_path, evaluate):
 def test_two_policies_are_compared_in_pairs_and_other_conditions_are_refused(
     law, tmp_path, evaluate
 ):
-    words = ["--seeds", 6, "--rtt", 0, "--success-at", 500, "--policy"]
+    words = ["--seeds", 6, "--rtt", 0, "--max-steps", 60, "--success-at", 60, "--policy"]
     (tmp_path / "left.py").write_text("def infer(o):\n    return {'actions': [[0]]}\n")
     evaluate(*words, tmp_path / "left.py", "--out", tmp_path / "a")
     versus = [*words, law(), "--versus", tmp_path / "a", "--out"]
@@ -148,7 +148,7 @@ def test_a_condition_without_any_answer_stands_at_the_asked_time():
 
 
 def test_the_bytes_of_an_observation_and_their_time_on_the_link_are_told(law, tmp_path, evaluate):
-    words = "--link lte --rtt 0 --seeds 1 --observation-bytes 27600 --policy".split()
+    words = "--link lte --rtt 0 --seeds 1 --max-steps 60 --observation-bytes 27600 --policy".split()
     run = evaluate(*words, law(), "--out", tmp_path / "a")
     assert (
         "27,600 bytes in 23 packets (datagrams), 22.595 ms" in run.err
@@ -164,7 +164,7 @@ def test_the_bytes_of_an_observation_and_their_time_on_the_link_are_told(law, tm
 
 
 def test_a_server_is_asked_over_a_stream_unless_another_delivery_is_given(law, tmp_path, evaluate):
-    words = "--link lossy --rtt 0 --seeds 1 --observation-bytes 27600 --out".split()
+    words = "--link lossy --rtt 0 --seeds 1 --max-steps 60 --observation-bytes 27600 --out".split()
     with serving(law()) as url:
         evaluate(*words, tmp_path / "a", "--policy", url)
         evaluate(*words, tmp_path / "b", "--policy", url, "--delivery", "datagrams")
@@ -175,12 +175,15 @@ def test_a_server_is_asked_over_a_stream_unless_another_delivery_is_given(law, t
 
 def test_the_page_has_figure_tests_notes_and_how_it_was_made(law, tmp_path, monkeypatch, evaluate):
     monkeypatch.undo()
+    monkeypatch.setattr("cloudrc.eval.page.PRINT_KINDS", ("svg",))
     words = "--seeds 2 --rtt 200,0 --deadline 0.1 --executor newest,time-indexed --policy".split()
-    evaluate(*words, law(), "--out", out := tmp_path / "e")
+    limit = "--env-arg", "max_episode_steps=60"
+    evaluate(*words, law(), *limit, "--out", out := tmp_path / "e")
     document = json.loads((out / "eval.json").read_text())
     page = (out / "report.html").read_text()
     made = document["cite"][:20], document["command"], "rate_kbit"
-    for text in ("no network", "<svg", "P(age &gt;", "0/2/0", *made):
+    for text in ("no network", "P(age &gt;", "0/2/0", *made):
         assert text in page
+    assert page.count("<svg") == 2
     assert [each["rtt_ms"] for each in document["tests"]] == [0.0, 200.0]
     assert [each["rtt_ms"] for each in document["outcomes"]] == [None, *[0.0, 200.0] * 2]

@@ -37,28 +37,31 @@ def test_a_link_that_does_not_change_has_no_time_line():
     assert find_met(EvalSetup("E", "p", link="lte", step=STEP), [row(0.0, 500)]) is None
 
 
-def test_handover_in_cartpole_as_drawn(law, evaluate, tmp_path):
-    out = tmp_path / "o"
-    words = "--link handover --seeds 20 --max-steps 250 --policy".split()
-    evaluate(*words, law(), "--out", out)
+def test_the_outages_that_episodes_of_cartpole_meet_are_told(law, evaluate, tmp_path):
+    out, link = tmp_path / "o", tmp_path / "outages.yaml"
+    link.write_text(
+        "uplink: {repeat_s: 4, blackouts: [{start_s: 1, duration_s: 0.1}, {start_s: 2,"
+        " duration_s: 1.5}]}\n"
+    )
+    evaluate(*"--seeds 8 --max-steps 60 --link".split(), link, "--policy", law(), "--out", out)
     rows = [json.loads(line) for line in (out / "rows.jsonl").read_text().splitlines()]
     rows = [each for each in rows if each["point"]["executor"] == "newest"]
     starts = [each["link_start"] for each in rows]
-    assert len({*starts}) == 20
-    assert all(0.0 < start < 30.0 for start in starts)
+    assert len({*starts}) == 8
+    assert all(0.0 < start < 4.0 for start in starts)
     document = json.loads((out / "eval.json").read_text())
     ends = [
         start + each["numbers"]["steps"] * 0.02 for start, each in zip(starts, rows, strict=True)
     ]
     for event in document["time_line"]["events"]:
-        begins = event["begin"], event["begin"] + 30.0
+        begins = event["begin"], event["begin"] + 4.0
         length = event["end"] - event["begin"]
         drawn = sum(
             any(begin < end and start < begin + length for begin in begins)
             for start, end in zip(starts, ends, strict=True)
         )
-        assert event["met"] == drawn
-    assert any(note.startswith("time line of 30 s: ") for note in document["notes"])
+        assert 0 < event["met"] == drawn < 8
+    assert any(note.startswith("time line of 4 s: ") for note in document["notes"])
 
 
 def test_a_profile_is_known_by_where_it_begins(tmp_path):
