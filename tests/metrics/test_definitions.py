@@ -138,7 +138,11 @@ def of(name, *settings):
     return flight_of(Recording.from_records(*both), experiment), *both
 
 
-LOSSY = ("hover", "link.both.loss=0.1", "link.both.delay_ms=30", "link.both.jitter_ms=20", "seed=3")
+HOVER = "hover", "mission.waypoints.0.dwell_s=10"
+LOSSY = (
+    *(*HOVER, "seed=3"),
+    *("link.both.loss=0.1", "link.both.delay_ms=30", "link.both.jitter_ms=20"),
+)
 
 
 def average(live, name):
@@ -246,7 +250,7 @@ def test_the_holds_of_a_flight_are_equal_live_and_in_the_report(first):
 
 
 def test_delay_errors_of_a_flight_match_its_ground_truth():
-    _, world, cloud = of("hover", "link.profile=paper-p2", "cloud.clock_offset_s=5")
+    _, world, cloud = of(*HOVER, "link.profile=paper-p2", "cloud.clock_offset_s=5")
     horizons = {r.counter: r.horizon for r in cloud if isinstance(r, Control)}
     applied = [r for r in world if isinstance(r, CommandApplied)]
     truth = {horizons[r.counter] - (r.stamp_ns - r.basis_stamp_ns) * 1e-9 for r in applied}
