@@ -2,6 +2,8 @@
 
 """Experiment and link profile reach the pods in files that the package reads."""
 
+import shutil
+
 import pytest
 import yaml
 
@@ -12,33 +14,38 @@ from cloudrc.config.shipped import names
 from tests.chart.conftest import of_kind, pod_specs, render
 
 MEASURED = {"drive.csv": "time_s,delay_ms\n0,30\n1,40\n2,35\n"}
+CONFIGS = "templates/shared/experiment.yaml", "templates/link/"
 TABLE = {"delay_ms": 35, "jitter_ms": 4, "distribution": "table", "table": "drive.csv"}
 
 
 @pytest.fixture
 def config(tmp_path):
-    """Write the files of a ConfigMap as a pod sees them."""
+    """Write the files of a ConfigMap as a pod sees them, into a folder of its own."""
 
-    def write(values, name):
-        for file, text in of_kind(render(values), "ConfigMap")[name]["data"].items():
-            (tmp_path / file).write_text(text)
-        return tmp_path
+    def write(values, name, **where):
+        shutil.rmtree(tmp_path / name, ignore_errors=True)
+        (tmp_path / name).mkdir()
+        for file, text in of_kind(render(values, **where), "ConfigMap")[name]["data"].items():
+            (tmp_path / name / file).write_text(text)
+        return tmp_path / name
 
     return write
 
 
 @pytest.fixture
 def experiment(config):
-    return lambda values=None: load_experiment(config(values, "experiment") / "experiment.yaml")
+    return lambda values, **where: load_experiment(
+        config(values, "experiment", **where) / "experiment.yaml"
+    )
 
 
 @pytest.fixture
-def profile(config, tmp_path):
+def profile(config):
     """Load the link as the link container does."""
 
-    def load(values):
-        config(values, "experiment")
-        return load_link(config(values, "link") / "profile.yaml", tmp_path / "experiment.yaml")
+    def load(values, only=CONFIGS):
+        link, whole = (config(values, name, only=only) for name in ("link", "experiment"))
+        return load_link(link / "profile.yaml", whole / "experiment.yaml")
 
     return load
 
@@ -48,7 +55,7 @@ def test_the_configmap_loads_as_the_same_experiment(name, experiment, profile):
     resolved = load_experiment(name)
     values = {"experiment": yaml.safe_load(dump(resolved))}
     assert experiment(values) == resolved
-    link = profile(values)
+    link = profile(values, only="templates/")
     assert (link.uplink, link.downlink) == (resolved.uplink, resolved.downlink)
 
 
@@ -67,14 +74,14 @@ def test_a_profile_replaces_the_experiments_link(profile):
 @pytest.mark.parametrize(("key", "way"), [("trace", {"trace": "drive.csv"}), ("table", TABLE)])
 def test_a_named_file_is_in_each_configmap_that_names_it(key, way, tmp_path, experiment, profile):
     """Every process loads the whole experiment, even if a profile replaces its link."""
-    file = str(tmp_path / "drive.csv")
+    file = str(tmp_path / "experiment" / "drive.csv")
     of_profile = {"link": {"profile": {"uplink": way}, "traces": MEASURED}}
-    assert getattr(profile(of_profile).uplink, key) == file
+    assert getattr(profile(of_profile).uplink, key) == str(tmp_path / "link" / "drive.csv")
     of_experiment = {"experiment": {"link": {"uplink": way}}, "link": {"traces": MEASURED}}
     assert getattr(profile(of_experiment).uplink, key) == file
     for over in ({}, {"profile": "wifi"}):
         values = {**of_experiment, "link": {"traces": MEASURED, **over}}
-        assert getattr(experiment(values).uplink, key) == file
+        assert getattr(experiment(values, only=CONFIGS).uplink, key) == file
 
 
 def test_h264_needs_images_of_ones_own():

@@ -6,10 +6,12 @@ import pytest
 
 from tests.chart.conftest import a_namespace, containers, nothing, pod_specs, render
 
+ENDS = "templates/world/", "templates/cloud/"
+
 
 def modes(lookup, values=None):
     """Return the mode in the arguments of both link containers."""
-    pods = pod_specs(render(values, lookup=lookup))
+    pods = pod_specs(render(values, only=ENDS, lookup=lookup))
     found = (containers(pods[end])["link"]["args"] for end in ("world", "cloud"))
     return {text for arguments in found for text in arguments if text.startswith("--mode")}
 

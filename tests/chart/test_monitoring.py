@@ -28,7 +28,8 @@ RECORDED = {rule["record"] for rule in RULES if "record" in rule}
 def test_monitors_need_the_value_and_the_kind_or_force():
     def monitors(more, **where):
         values = {key: {"enabled": True, **more} for key in ("podMonitor", "prometheusRule")}
-        made = {thing["kind"] for thing in render({"metrics": values}, **where)} & KINDS
+        objects = render({"metrics": values}, only="templates/monitoring/", **where)
+        made = {thing["kind"] for thing in objects} & KINDS
         is_missed = values["podMonitor"]["enabled"] and not made
         assert ("no Prometheus operator" in notes({"metrics": values}, **where)) == is_missed
         return made

@@ -33,7 +33,8 @@ def test_a_configmap_that_the_pods_could_not_use_is_refused(objects, said):
 
 def test_helm_test_and_notes_fly_the_mission_of_the_experiment():
     def flown(mission):
-        made = render({"experiment": {"mission": mission} if mission else {}})
+        values = {"experiment": {"mission": mission} if mission else {}}
+        made = render(values, only="templates/tests/")
         return yaml.safe_load(of_kind(made, "ConfigMap")["test"]["data"]["mission.yaml"])
 
     assert len(flown("pillars")["waypoints"][0]["position_m"]) == 2, "a robot on the ground"
