@@ -145,7 +145,7 @@ def test_a_command_is_refused_as_the_page_shows(command, printed, folder, monkey
 )
 def test_another_flight_works(command, is_whole, call):
     """By default only the first seconds of it are flown, so that its mission fails."""
-    short = [] if is_whole else ["--set", "criteria.time_limit_s=3"]
+    short = [] if is_whole else ["--set", "criteria.time_limit_s=2"]
     captured = call("", *shlex.split(command)[1:], *short, code=0 if is_whole else 1)
     too_short = "" if is_whole else r"cloudrc: warning: .*\n"
     assert PROGRESS.fullmatch(re.sub(too_short, "", captured.err))

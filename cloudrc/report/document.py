@@ -9,6 +9,7 @@ import os
 import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
@@ -153,13 +154,15 @@ def environment_document(
 
 def versions(names: Iterable[str]) -> dict[str, str]:
     """Return the versions of packages; leave out those that are not installed."""
-    found = dict[str, str]()
-    for name in names:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
+    return _known({name: _version(name) for name in names})
+
+
+@cache
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def _processor() -> str:

@@ -8,15 +8,20 @@ from tests.support.camera import needs_renderer
 
 
 @pytest.mark.parametrize(
-    ("experiment", "option"),
-    [("gap", ""), pytest.param("follow", "--camera", marks=needs_renderer)],
+    ("experiment", "option", "short"),
+    [
+        ("gap", "", ""),
+        pytest.param(
+            "follow", "--camera", "--set mission.follow.duration_s=8", marks=needs_renderer
+        ),
+    ],
 )
-def test_a_new_perception_moves_the_robot(tmp_path, monkeypatch, call, experiment, option):
+def test_a_new_perception_moves_the_robot(tmp_path, monkeypatch, call, experiment, option, short):
     monkeypatch.chdir(tmp_path)
     said = call(f"new perception mine.py {option}").out
     mine = f"run {experiment} --mode virtual --set cloud.perception=./mine.py"
     assert mine in said
-    flown = call(f"{mine} --report none --out run")
+    flown = call(f"{mine} --report none --out run {short}")
     assert "SUCCESS" in flown.out
     assert "perception_failed" not in flown.out
 
