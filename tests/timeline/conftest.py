@@ -25,8 +25,8 @@ SETTINGS = {
 
 
 @cache
-def records(*settings, experiment="hover"):
-    """Fly for 4 s; return the records of world and of cloud."""
+def records(*settings, experiment="hover", lasts_s=3):
+    """Fly for `lasts_s`; return the records of world and of cloud."""
     experiment = load_experiment(experiment, settings)
     _, _, teleop, run = assembly.assemble(experiment)
     found = [], []
@@ -35,7 +35,7 @@ def records(*settings, experiment="hover"):
         for records, more in zip(found, new, strict=True):
             records += more
 
-    run.fly(lambda: teleop.over, 4000 * MS, sink)
+    run.fly(lambda: teleop.over, lasts_s * 1000 * MS, sink)
     return found
 
 
@@ -46,9 +46,20 @@ def write(path, records, clock, clock_id="one"):
     return path
 
 
-def flight_of(folder, *settings, ahead_ns=0, experiment="hover"):
-    """Return a recorded flight; cloud's clock is ahead of world's."""
-    world, cloud = records(*settings, experiment=experiment)
+read_flights = {}
+
+
+def flight_of(folder, *settings, **about):
+    """Return a recorded flight as `_recorded` does; those alike are recorded once."""
+    key = settings, *about.items()
+    if key not in read_flights:
+        read_flights[key] = _recorded(folder, *settings, **about)
+    return read_flights[key]
+
+
+def _recorded(folder, *settings, ahead_ns=0, **about):
+    """Record a flight; cloud's clock is ahead of world's."""
+    world, cloud = records(*settings, **about)
     write(folder / "world.mcap", world, "world")
     later = [each._replace(stamp_ns=each.stamp_ns + ahead_ns) for each in cloud]
     write(folder / "cloud.mcap", later, "cloud", "another" if ahead_ns else "one")

@@ -57,7 +57,7 @@ def test_stages_of_scans_add_up_to_seen_to_acted(tmp_path, perception_ms):
     The perception is done 5 ms before a command. One that takes 130 ms makes scans wait.
     """
     settings = f"cloud.perception_ms={perception_ms}", *CONSTANT
-    flight = flight_of(tmp_path, *settings, experiment="gap")
+    flight = flight_of(tmp_path, *settings, experiment="gap", lasts_s=4)
     seen, applied = acted(flight)
     lengths = np.diff(budget_of(flight).scans.followed, axis=0)
     assert lengths.min() >= 0

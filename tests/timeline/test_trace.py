@@ -60,7 +60,7 @@ def test_the_file_keeps_the_rules_of_its_format(tmp_path, settings):
 
 def test_a_scan_has_slices_of_its_own_and_leads_to_its_command(tmp_path):
     settings = "cloud.perception_ms=70", *SETTINGS["constant"]
-    loop = of_flight(flight_of(tmp_path, *settings, experiment="gap"))
+    loop = of_flight(flight_of(tmp_path, *settings, experiment="gap", lasts_s=4))
     events = json.loads(write_trace({"loop": loop}, 1.0, 2.0))["traceEvents"]
     _, flows = check_rules(events)
     name = next(each["name"] for each in events if each["name"].startswith("scan for"))
