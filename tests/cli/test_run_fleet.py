@@ -11,6 +11,7 @@ from cloudrc.record.columns import Recording
 from tests.cli.conftest import FLY, SHORT
 
 FLEET = "--set fleet.robots=3 --set cell.rate_kbit=1000 --set cell.queue=newest".split()
+TWO = ["--set", "fleet.robots=2"]
 
 
 @pytest.mark.usefixtures("no_page")
@@ -47,7 +48,7 @@ def test_a_fleet_is_told_as_tables_and_leaves_a_folder_for_each_robot(folder, ca
 
 @pytest.mark.usefixtures("no_page")
 def test_a_fleet_that_flies_again_tells_which_own_files_have_changed(folder, call):
-    file, line = folder / "mine.py", [*FLY, *FLEET[:2], "--report", "none", "--out"]
+    file, line = folder / "mine.py", [*FLY, *TWO, "--report", "none", "--out"]
     file.write_text("from cloudrc.cloud.predictors.last_sample import build\n")
     call(*line, "a", "--set", "cloud.predictor=./mine.py")
     file.write_text(f"# new\n{file.read_text()}")
@@ -62,7 +63,7 @@ def test_a_robot_flies_alone_as_in_a_fleet_without_a_cell(folder, call):
     found = []
     for key in ("cloud.cores=2", "fleet.only=1"):
         sets = f"--set={key}", "--set=cloud.compute_ms=1", "--report=none", f"--out={key}"
-        call(*FLY, *FLEET[:2], *sets)
+        call(*FLY, *TWO, *sets)
         found.append(json.loads((folder / key / "report.json").read_text()))
     fleet, alone = found
     assert fleet["robots"][1]["records_sha256"] == alone["records_sha256"]

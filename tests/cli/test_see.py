@@ -63,10 +63,10 @@ def test_another_one_is_compared_and_its_failures_are_counted(call, folder):
 @needs_renderer
 @pytest.mark.usefixtures("no_page")
 def test_pictures_that_are_kept_are_seen_again(call):
-    fly = "run follow --mode virtual --report none --out a --set mission.follow.duration_s=4"
+    fly = "run follow --mode virtual --report none --out a --set mission.follow.duration_s=2"
     assert "the target out of view for 0.0% of the time" in call(fly).out
     summary = seen(call, "--perception target")["summary"]
-    assert summary["seen"] == pytest.approx(60, abs=3)
+    assert summary["seen"] == pytest.approx(30, abs=3)
     assert summary["apart_max_m"] == 0.0
 
 
@@ -75,7 +75,7 @@ def test_pictures_that_are_kept_are_seen_again(call):
 def test_each_of_several_pictures_that_came_at_one_time_is_seen(call):
     fly = ["run", "follow", "--mode", "virtual", "--report", "none", "--out", "a"]
     link = "link.uplink={delay_ms: 300, jitter_ms: 200, keep_order: true}"
-    assert main([*fly, "--set", "mission.follow.duration_s=4", "--set", link]) == 0
+    assert main([*fly, "--set", "mission.follow.duration_s=1", "--set", link]) == 0
     shown = Recording.read(Path("a/mission.mcap"))["/frame_shown"]["stamp_ns"].tolist()
     assert len(set(shown)) < len(shown)
     assert seen(call, "")["summary"]["apart_max_m"] == 0.0

@@ -73,7 +73,7 @@ def test_late_wakes_of_the_ends_are_no_fault_of_the_link():
 def test_cloud_judges_round_trips_without_a_common_clock(slower, verdict):
     up, down = profile_of(0.040), profile_of(0.080)
     heard = []
-    for arrival in arrivals(up, 30.0, overhead=nan, uplink=True):
+    for arrival in arrivals(up, 15.0, overhead=nan, uplink=True):
         rtt = 0.120 + slower + arrival.counter * 1e-9
         heard += [arrival, control(arrival.stamp_ns * 1e-9, rtt=rtt)]
     moments, _ = checked(hearing(up, down, uplink=True), heard)

@@ -83,7 +83,7 @@ def test_a_packet_that_is_ready_when_a_slot_begins_takes_it():
 @pytest.mark.parametrize(("phase", "mean"), [(0.0, 8.0), (2.1, 15.9), (6.0, 12.0)])
 def test_telemetry_at_100_hz_has_the_delay_of_its_phase(phase, mean):
     times = range(0, COUNT * 10 * MS, 10 * MS)
-    assert {*delays(link(radio(phase_ms=phase)), times)} == {mean}
+    assert {*delays(link(radio(phase_ms=phase)), times[:1000])} == {mean}
     found = delays(link(radio(phase_ms=phase, error=0.1)), times)
     assert found.mean() == pytest.approx(mean + 0.5556, abs=3 * found.std() / COUNT**0.5)
 

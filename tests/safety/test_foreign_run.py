@@ -15,6 +15,7 @@ from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import dump
 from cloudrc.drivers.machine import interpreter
 from cloudrc.processes import ends
+from cloudrc.report.figures import FIGURES
 from cloudrc.runs.links.verify import find_experiment
 from cloudrc.trials.workers import map_in_order
 from tests.metrics.conftest import flown
@@ -61,6 +62,7 @@ def run(tmp_path, spy):
 
 def test_a_report_executes_nothing_of_the_run(run, trace, monkeypatch):
     monkeypatch.setattr("cloudrc.report.page.b64encode", lambda svg: b"")  # a smaller page
+    monkeypatch.setattr("cloudrc.report.figures.FIGURES", {"error": FIGURES["error"]})
     assert main(["report", str(run)]) == 1
     assert not trace.exists()
     assert json.loads((run / "report.json").read_text())["experiment"] == "config"

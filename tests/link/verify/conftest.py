@@ -3,6 +3,7 @@
 """Probes and flights over links in virtual time, shaped as by the relay or by netem."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -25,6 +26,7 @@ def asked(name, way):
 
 SEED, KINDS = 1, {True: Kind.TELEMETRY, False: Kind.COMMAND}
 PERIOD_NS = 10_000_000
+plan_of = cache(plan_probes)
 OVERHEAD = 8e-5
 """Delay that a good relay and the network stack add [s]."""
 
@@ -36,7 +38,7 @@ def rows_of(profile, real, *, stall=0.0, netem=False):
     the random numbers do not follow the experiment's seed.
     """
     flow = Flow(SEED, True, PROBE, SIZES[Kind.TELEMETRY])
-    plan = plan_probes(profile, flow, drawn=netem)
+    plan = plan_of(profile, flow, drawn=netem)
     link = replace(plan, profile=real)
     if netem:
         link = replace(link, profile=netem_makes(real), flow=flow._replace(seed=2))
