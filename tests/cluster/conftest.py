@@ -267,6 +267,7 @@ def deployment(component, **status):
 
 
 TOKEN = "operator-token-of-the-release"
+FAST = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 CONFIG_PLACE = "kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION"
 """Where the client keeps the path of the kubeconfig."""
 
@@ -277,6 +278,7 @@ def api(tmp_path, monkeypatch):
     server.put("namespaces", {"metadata": {"name": "demo"}})
     path = tmp_path / "kubeconfig"
     path.write_text(kubeconfig(server.server.url))
+    monkeypatch.setattr(yaml, "SafeLoader", FAST)  # the client reads the kubeconfig
     monkeypatch.setattr(CONFIG_PLACE, str(path))
     monkeypatch.setattr(jobs, "LOOK_PERIOD", 0.01)
     monkeypatch.setattr(client, "RETRIES", {**client.RETRIES, "backoff_factor": 0.01})

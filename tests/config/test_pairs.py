@@ -88,13 +88,19 @@ def loads(file, *settings):
     return True
 
 
+valid = {}
+"""Key -> a setting that was valid for another file."""
+
+
 def valid_settings(file):
-    """Return a setting for each key that has a value with which the experiment loads: the last."""
+    """Return a setting for each key that has a value with which the experiment loads."""
     keys = [key for key in FORMS if "downlink" not in key]
     found = []
     for key in keys:
-        tried = (f"{key}={json.dumps(value)}" for value in reversed([*values(key)]))
-        found += next(([one] for one in tried if loads(file, one)), [])
+        tried = [f"{key}={json.dumps(value)}" for value in reversed([*values(key)])]
+        tried = [*filter(None, [valid.get(key)]), *tried]
+        if setting := next((one for one in tried if loads(file, one)), None):
+            found.append(valid.setdefault(key, setting))
     return found
 
 
