@@ -12,7 +12,9 @@ from tests.conftest import wait_until
 
 
 @pytest.fixture
-def steering(api):
+def steering(api, monkeypatch):
+    """Steering whose thread, which nothing ends, looks at the state once and then sleeps."""
+    monkeypatch.setattr("cloudrc.console.steering.WATCH_PERIOD", 1e5)
     api.answers["/v1/state"] = {"mission": None}
     return Steering(api)
 
@@ -67,3 +69,4 @@ def test_a_stop_is_repeated_until_the_api_answers(api, steering):
     count = len(api.posted)
     time.sleep(0.3)  # longer than STOP_PERIOD
     assert len(api.posted) == count
+    steering.end_drive()
