@@ -12,7 +12,7 @@ from tests.support.camera import needs_renderer
     [
         ("gap", "", ""),
         pytest.param(
-            "follow", "--camera", "--set mission.follow.duration_s=8", marks=needs_renderer
+            "follow", "--camera", "--set mission.follow.duration_s=6", marks=needs_renderer
         ),
     ],
 )
