@@ -84,12 +84,12 @@ def pytest_configure(config):
 def pytest_collection_finish():
     """Let the garbage collector skip what is loaded by now: it took a tenth of all time.
 
-    Flights and commands freeze and thaw what they have loaded, which would end this. What is loaded
-    later is visited more rarely than usual.
+    Flights and commands freeze and thaw what there is, and to thaw would end this: so what a flight
+    leaves behind stays frozen, too. What is loaded later is visited more rarely than usual.
     """
     gc.collect()
     gc.freeze()
-    gc.freeze = gc.unfreeze = lambda: None
+    gc.unfreeze = lambda: None
     gc.set_threshold(20_000, 20, 20)
     gc.enable()
 
