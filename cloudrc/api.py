@@ -30,6 +30,7 @@ from cloudrc.metrics.flight import Columns, Flight
 from cloudrc.metrics.response import Step, steps
 from cloudrc.metrics.verdict import FlightFailure
 from cloudrc.outside.refusal import check_names, naming
+from cloudrc.outside.reuse import reuse_results
 from cloudrc.outside.values import Quantity, to_plain
 from cloudrc.record.columns import Recording, Table
 from cloudrc.runs.experiment import advice_on, check_mode, load
@@ -165,11 +166,12 @@ def fly(
     check_names("mode", [mode], MODES)
     require(f"mode {mode}", MODES[mode])
     own = {} if seed is None else {"seed": seed}
-    resolved = load(str(experiment), [*_texts(settings or {}), *_texts(own)])
-    check_mode(resolved, mode)
-    _warn(resolved)
-    if mode == "virtual" and out is None:
-        return _result(fly_in_memory(resolved))
+    with reuse_results():  # checks, warnings and flight look at the same files
+        resolved = load(str(experiment), [*_texts(settings or {}), *_texts(own)])
+        check_mode(resolved, mode)
+        _warn(resolved)
+        if mode == "virtual" and out is None:
+            return _result(fly_in_memory(resolved))
     if mode != "cluster":
         return _fly_here(resolved, mode, out)
     from cloudrc.cluster.client import connect
