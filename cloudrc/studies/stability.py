@@ -96,10 +96,13 @@ def _fly_step(experiment: ResolvedExperiment, size: float) -> Answer:
     else:
         start, step = np.array((0.0, 0.0, END_HEIGHT - size)), np.full(3, size)
     end = start + step
-    stepped = fly(experiment, start, end, window)
-    still = fly(experiment, start, start, window)
-    if problem := stepped.problem or still.problem:
-        return {"stable": False, "code": problem[0], "text": problem[1]}
+    tracks = []
+    for point in (end, start):
+        track = fly(experiment, start, point, window)
+        if track.problem:
+            return {"stable": False, "code": track.problem[0], "text": track.problem[1]}
+        tracks.append(track)
+    stepped, still = tracks
     answer = judge(response(stepped, still, step), stepped.step_ns, window, size)
     return answer | {"speed_limited": stepped.speed_limited}
 

@@ -109,8 +109,9 @@ def test_the_limit_of_stability_is_that_of_the_linear_model(predictor, gains):
 @pytest.mark.parametrize(
     ("predictor", "rtt", "stable"),
     [
-        ("command_history", 1.5, True),
-        *nightly_rows(("command_history", 3.0, True), ("last_sample", 3.0, False)),
+        ("command_history", 1.0, True),
+        *nightly_rows(*(("command_history", rtt, True) for rtt in (1.5, 3.0))),
+        *nightly_rows(*(("last_sample", rtt, False) for rtt in (1.0, 3.0))),
     ],
 )
 def test_a_predictor_that_replays_the_commands_is_stable_at_3_s(predictor, rtt, stable):
