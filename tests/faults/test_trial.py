@@ -63,6 +63,7 @@ HELD = Schedule(
     hold_max=2.0,
 )
 """Several HOLDs, a stop, and a LAND."""
+STOPPED = Schedule(3, events=(FaultEvent("stopped", 3.0),), duration=13.5)
 
 
 AWAY = Schedule(1, "ideal", (FaultEvent("blackout", 4.0, 3.0),), duration=9.0)
@@ -82,10 +83,10 @@ def applies_late_commands(patch):
     [
         (lambda patch: None, "", HELD),
         (ignores(limits, "ramp_ns", lambda *_: 0), "cap", replace(HELD, duration=6.0)),
-        (ignores(Guard, "_alone_max_ns", 3_600_000 * MS), "hold", HELD),
+        (ignores(Guard, "_alone_max_ns", 3_600_000 * MS), "hold", replace(HELD, duration=15.0)),
         (applies_late_commands, "order", Schedule(1, reorder=0.5, duration=4.0)),
-        (ignores(EmergencyStopRepeater, "sound"), "obeyed", HELD),
-        (ignores(MissionService, "acknowledge"), "stuck", HELD),
+        (ignores(EmergencyStopRepeater, "sound"), "obeyed", STOPPED),
+        (ignores(MissionService, "acknowledge"), "stuck", STOPPED),
         (
             ignores(limits, "limit_to_fence", lambda velocity, *_: velocity),
             *("fence", replace(AWAY, policy="towards-a-face", robot="rover")),

@@ -78,7 +78,8 @@ def test_values_over_two_decades_have_a_logarithmic_axis_in_a_unit_between_them(
         ("robots", "robots"),
     ],
 )
-def test_a_figure_has_words_in_place_of_keys_and_explains_hollow_markers(key, words):
+def test_a_figure_has_words_in_place_of_keys_and_explains_hollow_markers(key, words, monkeypatch):
+    monkeypatch.setattr("cloudrc.report.figures.bands.PRINT_KINDS", ("svg",))
     panel = Panel("error", "m", {"a": [Point(1.0, 1.0, 1.0, 1.0, failed=True)]}, is_log=True)
     svg = draw([panel], key, [], "cloud.predictor", look=Look())["svg"].decode()
     for text in (words, "error (m)", "predictor", "hollow: a flight failed"):

@@ -16,6 +16,7 @@ from cloudrc.robots.native.library import (
 )
 
 COMPILERS = dict(compilers())
+COPIES = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[sys.argv.index('-o') + 1])"
 
 
 @pytest.fixture(autouse=True)
@@ -27,6 +28,14 @@ def cache(tmp_path, monkeypatch):
     module._load.cache_clear()
     yield tmp_path / "cloudrc"
     module._load.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def copier(tmp_path_factory):
+    """Return the command of a compiler that gives out what the first one has made."""
+    made = tmp_path_factory.mktemp("made") / "step.so"
+    compile_to(made, next(iter(COMPILERS.values())))
+    return [sys.executable, "-S", "-c", COPIES, str(made)]
 
 
 def use(monkeypatch, *found):
@@ -65,9 +74,9 @@ def test_a_compiler_is_used_once(name, monkeypatch, cache):
 
 @pytest.mark.skipif(not COMPILERS, reason="no compiler here")
 @pytest.mark.parametrize("where", ["folder", "file"])
-def test_a_file_that_others_may_write_is_not_used(where, monkeypatch, cache):
-    name, command = next(iter(COMPILERS.items()))
-    use(monkeypatch, (name, command))
+def test_a_file_that_others_may_write_is_not_used(where, monkeypatch, cache, copier):
+    name = next(iter(COMPILERS))
+    use(monkeypatch, (name, copier))
     cache.mkdir(mode=0o700)
     planted = built_file(cache, name)
     planted.write_bytes(b"no library")
@@ -81,12 +90,12 @@ def test_a_file_that_others_may_write_is_not_used(where, monkeypatch, cache):
 
 
 @pytest.mark.skipif(not COMPILERS, reason="no compiler here")
-def test_a_built_file_beside_the_module_is_used_even_in_a_pod(monkeypatch, tmp_path):
+def test_a_built_file_beside_the_module_is_used_even_in_a_pod(monkeypatch, tmp_path, copier):
     built = built_file(tmp_path)
     monkeypatch.setattr(module, "built_file", lambda *given: built)
     monkeypatch.setenv(POD, "10.0.0.1")
     built.write_bytes(b"torn")
     assert module.library().text.startswith("Python (step-")
     module._load.cache_clear()
-    compile_to(built, next(iter(COMPILERS.values())))
+    compile_to(built, copier)
     assert module.library().text == "C (built with the package)"
