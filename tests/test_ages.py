@@ -42,7 +42,7 @@ def test_computing_delays_commands_and_a_blackout_does_not_count():
 def test_the_largest_age_is_that_of_a_flight(settings):
     """Cloud computes one command after the other, so that the computing time counts twice."""
     raised = "guard.command_age_max_ms=3000", "cloud.freeze_after_s=3"
-    settings = "link.profile=ideal", *settings, *raised
+    settings = "link.profile=ideal", *settings, *raised, "mission.waypoints.0.dwell_s=8"
     expected, _ = simulate_ages(load_experiment("hover", settings))
     peak = numbers(fly("hover", *settings))["age_at_actuator_max"]
     assert peak == pytest.approx(max(expected), abs=0.0021)  # the guard looks every 2 ms

@@ -121,6 +121,7 @@ def test_a_hold_is_announced_if_and_only_if_the_guard_holds(delay, jitter, other
 
 @pytest.mark.parametrize("compute_ms", [122, 126])  # with 122, 2 ms too old between two looks
 def test_a_hold_because_of_a_slow_cloud_is_announced_if_and_only_if_the_guard_holds(compute_ms):
-    settings = "link.profile=ideal", f"cloud.compute_ms={compute_ms}"
+    brief = "mission.waypoints.0.dwell_s=8", "criteria.time_limit_s=12"
+    settings = "link.profile=ideal", f"cloud.compute_ms={compute_ms}", *brief
     warned = any("guard" in text for text in advise(load_experiment("hover", settings)))
     assert warned == (numbers(fly("hover", *settings))["hold_count"] > 0) == (compute_ms > 125)

@@ -19,6 +19,7 @@ from cloudrc.messages import (
     Request,
     Start,
 )
+from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.records import Counted, GuardChange, TelemetrySent
 from cloudrc.runs.flight import fly_in_memory
 from cloudrc.tunnel import codec
@@ -237,6 +238,13 @@ def records(experiment):
 def fly(name, *settings):
     """Fly and return numbers and verdict; tests of the same flight share it."""
     return fly_in_memory(load_experiment(name, settings))
+
+
+def sha256(experiment):
+    """Fly and return the hash of all records, which is that of a report, too."""
+    store = RecordStore()
+    assembly.fly(experiment, store.add)
+    return Recording(records=store).sha256
 
 
 def numbers(assessment):

@@ -10,6 +10,7 @@ from tests.flights.conftest import both_ways, fly
 
 MS = 1_000_000
 ARRIVAL = "cloud.answers=arrival"
+BRIEF = "link.profile=ideal", "mission.waypoints.0.dwell_s=4"
 
 
 def means(flight):
@@ -20,7 +21,7 @@ def means(flight):
 @pytest.mark.parametrize(("compute", "most"), [(0, 0.2), (7, 0.2), (14, 6.0)])
 def test_no_telemetry_waits_for_a_period_but_for_a_computation(compute, most):
     """33 ms up and 33 ms down; the step adds up to 2 ms, a computation of 14 ms a wait for it."""
-    settings = "link.profile=ideal", *both_ways(delay_ms=33), f"cloud.compute_ms={compute}"
+    settings = *BRIEF, *both_ways(delay_ms=33), f"cloud.compute_ms={compute}"
     found = means(fly("hover", *settings, ARRIVAL).flight)
     assert 0 <= found["queue"] <= most
     assert found.get("compute", 0) == compute
@@ -31,7 +32,7 @@ def test_no_telemetry_waits_for_a_period_but_for_a_computation(compute, most):
 
 @pytest.mark.parametrize("settings", [both_ways(delay_ms=40, jitter_ms=15), both_ways(loss=0.4)])
 def test_commands_are_half_a_period_to_one_and_a_half_apart(settings):
-    flight = fly("hover", "link.profile=ideal", *settings, ARRIVAL).flight
+    flight = fly("hover", *BRIEF, *settings, ARRIVAL).flight
     made_ns = np.diff(flight.during("/delay_estimate")["stamp_ns"])
     assert made_ns.min() == 5 * MS
     assert made_ns.max() == 15 * MS
@@ -39,5 +40,5 @@ def test_commands_are_half_a_period_to_one_and_a_half_apart(settings):
 
 
 def test_by_default_a_command_is_made_in_each_period():
-    flight = fly("hover", "link.profile=ideal", *both_ways(delay_ms=40, jitter_ms=15)).flight
+    flight = fly("hover", *BRIEF, *both_ways(delay_ms=40, jitter_ms=15)).flight
     assert set(np.diff(flight.during("/delay_estimate")["stamp_ns"]).tolist()) == {10 * MS}

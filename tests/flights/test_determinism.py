@@ -13,23 +13,19 @@ from cloudrc.assembly import assemble, build_cloud, build_links, build_world, st
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.record.columns import Recording, RecordStore
-from cloudrc.runs.flight import fly_in_memory
 from cloudrc.tunnel.codec import DecodeError
 from cloudrc.tunnel.end import Identity
-from tests.flights.conftest import both_ways, ring
+from tests.flights.conftest import both_ways, ring, sha256
 from tests.support.commands import python
 
 SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 1.0}]", "mission.touch=null")
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = sorted((ROOT / "cloudrc").rglob("*.py"))
 PRINT = """
-from tests.flights.test_determinism import digest, short
-print(digest(short()))
+from tests.flights.conftest import sha256
+from tests.flights.test_determinism import short
+print(sha256(short()))
 """
-
-
-def digest(experiment):
-    return fly_in_memory(experiment).records_sha256
 
 
 def short(*settings):
@@ -40,8 +36,8 @@ def short(*settings):
 def test_the_same_seed_gives_the_same_records_in_any_process():
     env = os.environ | {"PYTHONHASHSEED": "77", "PYTHONPATH": str(ROOT)}
     printed = python("-c", PRINT, env=env, check=True).stdout
-    again, other = digest(short()), digest(short("seed=2"))
-    assert printed.strip() == digest(short()) == again != other
+    first, again, other = map(sha256, (short(), short(), short("seed=2")))
+    assert printed.strip() == first == again != other
 
 
 PLAN = ("cloud.predictor=model_based", "cloud.estimator=earliest", "cloud.plan_s=0.4")
@@ -60,7 +56,7 @@ def test_objects_and_encrypted_bytes_make_the_same_records(settings):
     cloud = build_cloud(experiment, identity, teleop)
     run, records = VirtualRun(world, cloud, *build_links(experiment)), RecordStore()
     run.fly(lambda: teleop.over, 150_000_000_000, records.add)
-    assert Recording(records=records).sha256 == digest(experiment)
+    assert Recording(records=records).sha256 == sha256(experiment)
 
 
 def watch_damage(link, session):

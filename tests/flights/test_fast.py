@@ -31,7 +31,7 @@ def test_after_the_first_command_the_contact_comes_when_it_comes_without_delay(r
 
 
 def test_plans_predict_to_4_mm_with_fast_gains():
-    settings = ["mission=steps", "mission.steps.count=6", "world.scene=empty"]
+    settings = ["mission=steps", "mission.steps.count=3", "world.scene=empty"]
     settings.append("mission.touch=null")
     flight = fly("fast", *settings, "link.profile=paper-p3", "cloud.plan_s=0.4")
     assert flight.verdict.failures == ()

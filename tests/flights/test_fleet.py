@@ -11,9 +11,9 @@ from cloudrc.processes.ends import EndSettings, open_end
 from cloudrc.record.columns import Recording, RecordStore, datagrams
 from cloudrc.runs.experiment import check_mode, robots_of
 from cloudrc.runs.fleet import assemble_fleet
-from cloudrc.runs.flight import fly_in_memory
 from tests.config.conftest import refused
 from tests.conftest import nightly_rows
+from tests.flights.conftest import sha256
 
 SHORT = ("mission.steps.count=1", "mission.steps.period_s=0.5", "criteria.time_limit_s=1")
 VARIED = "fleet.vary=[{world.robot: x2, seed: 4}, {link.both.delay_ms: 60, link.both.loss: 0.02}]"
@@ -22,7 +22,7 @@ LATE = ("cloud.compute_ms=8", "cloud.compute_deviation_ms=4", "cloud.cores=1")
 
 
 def alone(*settings):
-    return fly_in_memory(load_experiment("steps", (*SHORT, *settings))).records_sha256
+    return sha256(load_experiment("steps", (*SHORT, *settings)))
 
 
 def fly_fleet(name, *settings):

@@ -2,7 +2,7 @@
 
 """A mission that follows a moving body ends with time, and the truth judges it."""
 
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -18,8 +18,13 @@ BLIND = ("camera=null", "cloud.perception=null", "mission.follow.duration_s=12")
 """The robot stays over its spawn."""
 
 
+@cache
+def blind():
+    return fly_in_memory(load_experiment("follow", BLIND))
+
+
 def test_a_robot_that_does_not_look_loses_the_board_and_flies_on():
-    found = fly_in_memory(load_experiment("follow", BLIND))
+    found = blind()
     (failure,) = found.verdict.failures
     assert failure.code == "target_lost"
     flight = found.flight
@@ -29,7 +34,7 @@ def test_a_robot_that_does_not_look_loses_the_board_and_flies_on():
 
 
 def test_the_board_moves_from_the_start_on_and_is_recorded_as_often_as_the_truth():
-    flight = fly_in_memory(load_experiment("follow", BLIND)).flight
+    flight = blind().flight
     target, truth = flight.recording["/target"], flight.recording["/ground_truth"]
     assert np.array_equal(target["stamp_ns"], truth["stamp_ns"])
     times = flight.seconds(target["stamp_ns"])
@@ -71,10 +76,10 @@ def test_bad_input_is_refused_in_one_line(settings, where):
 @needs_renderer
 def test_x2_follows_the_board_by_its_camera_alone():
     """At a round trip of 0 always in view; at 600 ms it loses it now and then."""
-    near = fly_in_memory(load_experiment("follow", ["mission.follow.duration_s=12"]))
+    near = fly_in_memory(load_experiment("follow", ["mission.follow.duration_s=7"]))
     assert near.verdict.outcome == "success"
     assert near.numbers["out_of_view"].value == 0.0
     assert near.numbers["bearing_error_rms"].value < 0.2
-    late = ["mission.follow.duration_s=12", "link.both.delay_ms=300"]
+    late = ["mission.follow.duration_s=7", "link.both.delay_ms=300"]
     far = fly_in_memory(load_experiment("follow", late))
     assert far.numbers["bearing_error_rms"].value > 2 * near.numbers["bearing_error_rms"].value

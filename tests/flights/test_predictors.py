@@ -12,7 +12,7 @@ FAST = (
     "cloud.controller={name: pid, gain_p: [2.5, 2.5, 3.0], gain_d: [0.5, 0.5, 0.0]}",
     "world.onboard.integral_limit_xy=0.3",
     "cloud.estimator=split",
-    "mission.steps.count=3",
+    "mission.steps.count=2",
 )
 BOX = "{name: model_based, integral_limit_xy: 0.3}"
 FILTERED = "{name: kalman, parameters: {integral_limit_xy: 0.3}}"

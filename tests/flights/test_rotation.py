@@ -50,7 +50,7 @@ def rotated(*steps):
 
 
 @pytest.mark.promise("keys-change-in-flight")
-@pytest.mark.parametrize(("ends", "apart"), [(ENDS, 0.0), (ENDS[::-1], 15.0)])
+@pytest.mark.parametrize(("ends", "apart"), [(ENDS, 0.0), (ENDS[::-1], 8.0)])
 def test_a_rotation_costs_one_short_hold_at_most(ends, apart):
     first, second = ends
     flight = rotated((first, NEW, apart), (second, NEW, apart + 6.0))

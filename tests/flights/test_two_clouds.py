@@ -112,7 +112,7 @@ def test_repeated_hellos_over_a_slow_lossy_link_open_no_session():
     """Each of them is seconds old when world gets it."""
     limits = "guard.command_age_max_ms=2000", "cloud.horizon_max_s=3", "cloud.freeze_after_s=3"
     link = both_ways(delay_ms=500, jitter_ms=100, loss=0.5)
-    flown = fly("hover", *link, *limits, "seed=3")
+    flown = fly("hover", *link, *limits, "criteria.time_limit_s=20", "seed=3")
     session = flown.flight.recording["/session"]
     causes = session["cause"][session["end"] == "world"]
     assert list(causes) == ["cloud said hello", "mission starts from spawn"]
