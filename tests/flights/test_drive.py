@@ -165,10 +165,11 @@ def test_a_drive_can_be_flown_again(tmp_path):
 
 
 @pytest.mark.promise("emergency-stop-gets-through")
-@pytest.mark.parametrize("count", [4, *nightly(100)])
-def test_a_stop_gets_through_thirty_percent_loss(count):
+@pytest.mark.parametrize("seeds", [range(7, 11), *nightly(range(1, 101))], ids=len)
+def test_a_stop_gets_through_thirty_percent_loss(seeds):
+    """The first request for the stop is lost with the seeds 7, 8 and 9."""
     took = []
-    for seed in range(1, count + 1):
+    for seed in seeds:
         drive = Drive(seed=seed, link=["link.both.loss=0.3"])
         flight, at = drive.flight, 2.0 + drive.random(0.0, 0.1)
         drive.press(1.6, 2.0, EAST)  # the operator who drives does not let go
