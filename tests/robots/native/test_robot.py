@@ -129,7 +129,7 @@ def test_commands_fly_the_same_in_c(make, seconds, spawn, limits, least, scene_a
         assert any(touches and touches[0].body == "board" for touches in pilots[1].seen[7::8])
 
 
-@pytest.mark.parametrize("seed", [0, *nightly(1, 2)])
+@pytest.mark.parametrize("seed", [1, *nightly(0, 2)])
 def test_plans_fly_the_same_in_c(seed):
     """Commands every 10 ms or much later; a plan's velocities are due at odd times."""
     robots = both(limits=ResolvedGuard(speed_max_mps=4.0, plan_max_s=0.8))
