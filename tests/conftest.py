@@ -18,6 +18,7 @@ import pytest
 from cloudrc.cli.main import main
 from cloudrc.config.shipped import file_of
 from cloudrc.outside.document import write_yaml
+from cloudrc.outside.reuse import reuse_results
 from cloudrc.runs.interrupts import forget_interrupt
 from tests.support.sweeps import GRID, SHORT
 
@@ -179,6 +180,16 @@ def signals_stay_as_they_were():
         if signal.getsignal(number) is not handler:
             signal.signal(number, handler)
     forget_interrupt()
+
+
+@pytest.fixture(scope="module")
+def shared_files():
+    """Read, check and compile the files of robots and scenes once for a module, as a sweep does.
+
+    No test of the module may change a file that another one flies.
+    """
+    with reuse_results():
+        yield
 
 
 @pytest.fixture

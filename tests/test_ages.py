@@ -8,6 +8,8 @@ from cloudrc.ages import simulate_ages
 from cloudrc.config.load import load_experiment
 from tests.flights.conftest import both_ways, fly, numbers
 
+pytestmark = pytest.mark.usefixtures("shared_files")
+
 
 def ages(*settings):
     return simulate_ages(load_experiment("steps", ["link.profile=ideal", *settings]))

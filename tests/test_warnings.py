@@ -12,6 +12,8 @@ from cloudrc.warnings import advise
 from tests.conftest import nightly_rows
 from tests.flights.conftest import both_ways, fly, numbers
 
+pytestmark = pytest.mark.usefixtures("shared_files")
+
 
 def both(delay, jitter, **others):
     return ["link.profile=ideal", *both_ways(delay_ms=delay, jitter_ms=jitter, **others)]

@@ -8,6 +8,8 @@ from tests.faults.measures import Requirement
 from tests.faults.scenarios import SCENARIOS
 from tools import faults
 
+pytestmark = pytest.mark.usefixtures("shared_files")
+
 QUICK = "world-restarted"
 
 

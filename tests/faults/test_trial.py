@@ -23,6 +23,8 @@ from tests.faults.invariants import check_order
 from tests.faults.schedule import FaultEvent, Schedule, compose, load
 from tests.faults.trial import fly
 
+pytestmark = pytest.mark.usefixtures("shared_files")
+
 MS = 1_000_000
 REGRESSIONS = sorted((Path(__file__).parent / "regressions").glob("*.yaml"))
 SHORT = [path for path in REGRESSIONS if load(path).duration < 30.0]

@@ -8,6 +8,8 @@ import pytest
 from cloudrc.metrics.budget import budget_of
 from tests.flights.conftest import both_ways, fly
 
+pytestmark = pytest.mark.usefixtures("shared_files")
+
 MS = 1_000_000
 ARRIVAL = "cloud.answers=arrival"
 BRIEF = "link.profile=ideal", "mission.waypoints.0.dwell_s=4"

@@ -23,9 +23,12 @@ from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.record.writer import McapWriter
 from cloudrc.runs.flight import fly_in_memory
 from cloudrc.tunnel.end import Identity
+from tests.conftest import nightly
 from tests.flights.conftest import ring, sha256
 from tests.support.camera import needs_renderer
 from tests.support.commands import python
+
+pytestmark = pytest.mark.usefixtures("shared_files")
 
 SHORT, BRIEF = (
     f"mission.waypoints=[{{position_m: [0, 0, 1], dwell_s: {seconds}, tolerance_m: 1}}]"
@@ -161,7 +164,7 @@ def test_a_flight_repeats_to_the_bit_also_with_encrypted_bytes():
 
 
 @needs_renderer
-@pytest.mark.parametrize("codec", ["jpeg", "h264"])
+@pytest.mark.parametrize("codec", [*nightly("jpeg"), "h264"])
 def test_a_flight_with_the_real_renderer_repeats_to_the_bit(codec, monkeypatch):
     if codec == "h264":
         pytest.importorskip("av", reason="PyAV comes with the extra camera")

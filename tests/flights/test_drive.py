@@ -20,6 +20,8 @@ from tests.faults.flight import FaultRun
 from tests.faults.schedule import Schedule, generator
 from tests.flights.conftest import fly
 
+pytestmark = pytest.mark.usefixtures("shared_files")
+
 EAST, WEST, UP = (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.0, 0.0, 0.5)
 ESTOP, GROUND = GuardState.ESTOP, GuardState.GROUND
 

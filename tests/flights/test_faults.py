@@ -13,6 +13,8 @@ from cloudrc.drivers.virtual import Clock
 from cloudrc.messages import GuardState
 from cloudrc.runs.flight import fly_in_memory
 
+pytestmark = pytest.mark.usefixtures("shared_files")
+
 SECOND = 10**9
 CLOUD_KILLED = "kind: cloud_killed, at_s: 4, duration_s: 0.8"
 CLOUD_PAUSED = "kind: cloud_paused, at_s: 4, duration_s: 2"

@@ -15,6 +15,8 @@ from tests.config.conftest import refused
 from tests.conftest import nightly_rows
 from tests.flights.conftest import sha256
 
+pytestmark = pytest.mark.usefixtures("shared_files")
+
 SHORT = ("mission.steps.count=1", "mission.steps.period_s=0.5", "criteria.time_limit_s=1")
 VARIED = "fleet.vary=[{world.robot: x2, seed: 4}, {link.both.delay_ms: 60, link.both.loss: 0.02}]"
 CLOCK = "cloud.clock_offset_s=5"

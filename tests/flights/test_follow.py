@@ -76,10 +76,10 @@ def test_bad_input_is_refused_in_one_line(settings, where):
 @needs_renderer
 def test_x2_follows_the_board_by_its_camera_alone():
     """At a round trip of 0 always in view; at 600 ms it loses it now and then."""
-    near = fly_in_memory(load_experiment("follow", ["mission.follow.duration_s=7"]))
+    near = fly_in_memory(load_experiment("follow", ["mission.follow.duration_s=5"]))
     assert near.verdict.outcome == "success"
     assert near.numbers["out_of_view"].value == 0.0
     assert near.numbers["bearing_error_rms"].value < 0.2
-    late = ["mission.follow.duration_s=7", "link.both.delay_ms=300"]
+    late = ["mission.follow.duration_s=5", "link.both.delay_ms=300"]
     far = fly_in_memory(load_experiment("follow", late))
     assert far.numbers["bearing_error_rms"].value > 2 * near.numbers["bearing_error_rms"].value

@@ -10,10 +10,10 @@ from cloudrc.config.schema import MissionConfig
 from tests.conftest import nightly
 from tests.flights.conftest import fly, numbers
 
-PROFILES = ("paper-p1", "paper-p2", "paper-p3")
+pytestmark = pytest.mark.usefixtures("shared_files")
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("profile", ["paper-p2", "paper-p3", *nightly("paper-p1")])
 @pytest.mark.parametrize("seed", [1, *nightly(*range(2, 11))])
 def test_the_paper_flies(profile, seed):
     flight = fly("paper", f"link.profile={profile}", f"seed={seed}")

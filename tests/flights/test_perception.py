@@ -21,6 +21,8 @@ from cloudrc.runs.flight import fly_in_memory
 from cloudrc.tunnel.end import Identity
 from tests.flights.conftest import ring
 
+pytestmark = pytest.mark.usefixtures("shared_files")
+
 SHORT = ("mission.waypoints=[{position_m: [2, 0], tolerance_m: 0.5}]",)
 LATE = ("link.both.delay_ms=300",)
 

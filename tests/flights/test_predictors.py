@@ -8,6 +8,8 @@ import pytest
 from tests.conftest import nightly_rows
 from tests.flights.conftest import both_ways, fly, numbers
 
+pytestmark = pytest.mark.usefixtures("shared_files")
+
 FAST = (
     "cloud.controller={name: pid, gain_p: [2.5, 2.5, 3.0], gain_d: [0.5, 0.5, 0.0]}",
     "world.onboard.integral_limit_xy=0.3",

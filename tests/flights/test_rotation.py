@@ -13,6 +13,8 @@ from tests.faults.inject import SECRET
 from tests.faults.measures import epochs
 from tests.faults.schedule import Schedule
 
+pytestmark = pytest.mark.usefixtures("shared_files")
+
 NEW = KeySet(Key(b"n" * 32), SECRET.current)
 ONLY = KeySet(NEW.current)
 DELAY = 0.05

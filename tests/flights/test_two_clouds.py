@@ -10,6 +10,8 @@ from cloudrc.records import Arrival
 from cloudrc.tunnel.codec import Kind
 from tests.flights.conftest import Bare, both_ways, fly, ring
 
+pytestmark = pytest.mark.usefixtures("shared_files")
+
 
 @pytest.fixture
 def bare():

@@ -9,6 +9,8 @@ from cloudrc.config.load import load_experiment
 from cloudrc.studies.stability import fly_step, judge
 from tests.conftest import nightly, nightly_rows
 
+pytestmark = pytest.mark.usefixtures("shared_files")
+
 PUBLISHED = (0.8, 0.8, 1.5), (0.0, 0.0, 0.0)
 FAST = (2.5, 2.5, 3.0), (0.5, 0.5, 0.0)
 """Gains P [1/s] and D [1] of the cloud controller in x, y and z."""

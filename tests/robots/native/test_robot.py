@@ -38,7 +38,10 @@ from tests.flights.conftest import CLOCK, ring, sha256
 from tests.world.conftest import model_of, simulate
 from tests.world.guard.conftest import LIMITS, MS, SECOND, UP, Flight, hostile
 
-pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
+pytestmark = [
+    pytest.mark.skipif(library().run is None, reason=library().text),
+    pytest.mark.usefixtures("shared_files"),
+]
 
 
 def parts(scene="empty", limits=LIMITS):

@@ -2,7 +2,7 @@
 
 """Multirotors made of MJCF text, and a flight that runs one controller in MuJoCo, without world."""
 
-from math import cos, hypot, pi, sin
+from math import acos, cos, degrees, hypot, pi, sin
 
 import numpy as np
 
@@ -94,7 +94,7 @@ class Flight:
         known = self.model if known is None else compiled(known)
         self.onboard = multirotor.build(known, **parameters)
         self.actuators = multirotor.actuators(known, DT, drag_s_per_m=drag)
-        self.tilt = 0.0
+        self._upright = 1.0
 
     @property
     def readings(self):
@@ -114,8 +114,13 @@ class Flight:
             self.data.qfrc_applied[:] = inputs[self.model.nu :]
             mujoco.mj_step(self.model, self.data)
             velocities.append(self.data.qvel[:3].copy())
-            self.tilt = max(self.tilt, np.degrees(np.arccos(min(1.0, readings.axes[8]))))
+            self._upright = min(self._upright, readings.axes[8])
         return np.array(velocities)
+
+    @property
+    def tilt(self):
+        """Largest tilt so far [deg]."""
+        return degrees(acos(self._upright))
 
     @property
     def yaw(self):
