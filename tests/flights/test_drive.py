@@ -105,7 +105,9 @@ def test_the_robot_holds_when_the_operator_is_lost(count):
 
 
 @pytest.mark.parametrize("robot", ["rover", "x2"])
-@pytest.mark.parametrize(("velocity", "turn"), [(EAST, 0.5), (WEST, -0.5), (ZERO, 0.8)])
+@pytest.mark.parametrize(
+    ("velocity", "turn"), [(EAST, 0.5), (ZERO, 0.8), *nightly_rows((WEST, -0.5))]
+)
 def test_a_robot_that_is_asked_to_turn_drives_a_circle(robot, velocity, turn):
     drive = Drive(robot=robot)
     drive.press(2.0, 3.0, velocity, turn)
