@@ -71,6 +71,43 @@ def without_collections() -> Iterator[None]:
             gc.enable()
 
 
+class _Waits:
+    """Records how long telemetry and commands wait on their way.
+
+    It does not know the run, so that a flight makes no reference cycle: nobody would collect it.
+    """
+
+    def __init__(self) -> None:
+        self._records = list[Record]()
+
+    def take(self) -> list[Record]:
+        """Return the records since the last call."""
+        records, self._records = self._records, []
+        return records
+
+    def note_cell(
+        self, uplink: bool, header: tuple[int, int, int], sent_ns: int, now_ns: int
+    ) -> None:
+        """Record how long telemetry or a command was in the cell."""
+        kind, epoch, counter = header
+        if kind in WATCHED:
+            self._records.append(CellWait(now_ns, uplink, epoch, counter, now_ns - sent_ns))
+
+    def note_link(
+        self,
+        uplink: bool,
+        packet: tuple[int, int, int],
+        now_ns: int,
+        queue_ns: int,
+        radio: RadioParts | None,
+    ) -> None:
+        """Record where telemetry or a command waits in the link."""
+        epoch, kind, counter = packet
+        if kind in WATCHED:
+            waits_ns = queue_ns, *(radio or (0, 0, 0))
+            self._records.append(LinkWait(now_ns, uplink, epoch, counter, *waits_ns))
+
+
 class VirtualRun:
     """Runs world, cloud and both directions of the link, in virtual time that starts at 0.
 
@@ -93,10 +130,10 @@ class VirtualRun:
         self.cloud_clock = cloud_clock
         self.in_flight = PacketQueue() if in_flight is None else in_flight
         self.now_ns = 0
-        self._waits = list[Record]()
-        self.in_flight.watch = self._note_cell
-        uplink.watch = partial(self._note_link, True)
-        downlink.watch = partial(self._note_link, False)
+        self._waits = waits = _Waits()
+        self.in_flight.watch = waits.note_cell
+        uplink.watch = partial(waits.note_link, True)
+        downlink.watch = partial(waits.note_link, False)
 
     def fly(self, until: Callable[[], bool], limit_ns: int, sink: Sink) -> None:
         """Run until `until()` is true or virtual time reaches `limit_ns` [ns].
@@ -112,8 +149,7 @@ class VirtualRun:
 
     def take_records(self) -> tuple[list[Record], list[Record]]:
         """Return the new records of world and of cloud."""
-        waits, self._waits = self._waits, []
-        return self._world.take_records() + waits, self._cloud.take_records()
+        return self._world.take_records() + self._waits.take(), self._cloud.take_records()
 
     @property
     def next_ns(self) -> int:
@@ -162,28 +198,6 @@ class VirtualRun:
                 if datagrams := cloud.take_datagrams():
                     self._send(datagrams, self._downlink)
         self.now_ns = end_ns
-
-    def _note_cell(
-        self, uplink: bool, header: tuple[int, int, int], sent_ns: int, now_ns: int
-    ) -> None:
-        """Record how long telemetry or a command was in the cell."""
-        kind, epoch, counter = header
-        if kind in WATCHED:
-            self._waits.append(CellWait(now_ns, uplink, epoch, counter, now_ns - sent_ns))
-
-    def _note_link(
-        self,
-        uplink: bool,
-        packet: tuple[int, int, int],
-        now_ns: int,
-        queue_ns: int,
-        radio: RadioParts | None,
-    ) -> None:
-        """Record where telemetry or a command waits in the link."""
-        epoch, kind, counter = packet
-        if kind in WATCHED:
-            waits_ns = queue_ns, *(radio or (0, 0, 0))
-            self._waits.append(LinkWait(now_ns, uplink, epoch, counter, *waits_ns))
 
     def _send(self, datagrams: list[Datagram], link: LinkDirection) -> None:
         for data in datagrams:

@@ -80,6 +80,7 @@ def boxes_around(model: Any, data: Any) -> tuple[Any, float]:
     return np.array(rows, float), radius
 
 
+@cache
 def mujoco_library() -> ctypes.CDLL:
     """Return MuJoCo's own library, which the engine has loaded."""
     folder = Path(mujoco.__file__).parent

@@ -110,7 +110,7 @@ class WorldEndpoint(TunnelEnd):
         self._sample_period_ns = min(odometry_period_ns, ODOMETRY_PERIOD_NS)
         self._count_ns, self._session_ns = start_ns + COUNT_PERIOD_NS, start_ns
         self._scanner, self._film, self._target = scanner, film, target
-        self._look = self._sample_and_sense if scanner or film else self._sample
+        self._senses = scanner is not None or film is not None
         self._scans = self._frames = 0  # that were due in this session
         self._scan_ns = self._frame_ns = NEVER_DUE_NS
         self._counted_slip_ns: int | None = None
@@ -202,6 +202,13 @@ class WorldEndpoint(TunnelEnd):
             tick_ns = self._tick_ns = self._run_robot(tick_ns, stop_ns)
         if samples and tick_ns == self._look_ns:
             self._look(tick_ns)
+
+    def _look(self, now_ns: int) -> None:
+        """Take what is due."""
+        if self._senses:
+            self._sample_and_sense(now_ns)
+        else:
+            self._sample(now_ns)
 
     def _apply(self, now_ns: int) -> None:
         assert self._waiting is not None
@@ -360,7 +367,7 @@ class WorldEndpoint(TunnelEnd):
         if self._film is not None:
             self._film.begin_session()
             self._frame_ns = now_ns
-        if self._scanner is not None or self._film is not None:
+        if self._senses:
             self._look_ns = min(self._sample_ns, now_ns)
         self._records.append(SessionOpened(now_ns, "world", epoch, cause))
         for observer in self.robot.observers:

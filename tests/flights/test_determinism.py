@@ -2,8 +2,10 @@
 
 """The same experiment and seed give identical records, on any wall clock."""
 
+import gc
 import os
 import re
+import weakref
 from collections import Counter
 from pathlib import Path
 
@@ -120,3 +122,16 @@ def test_nothing_on_the_control_path_reads_a_wall_clock():
     mine = {place: path for place, path in places.items() if place.startswith(CONTROL_PATH)}
     assert len(mine) > 60
     assert {place for place, path in mine.items() if WALL.search(path.read_text())} == ALLOWED
+
+
+@pytest.mark.parametrize("name", ["hover", "gap"])
+def test_a_flight_goes_with_its_last_name_because_a_sweep_collects_no_garbage(name):
+    run = assemble(load_experiment(name))[3]
+    run.advance(1_000_000_000)
+    ends = [weakref.ref(run), weakref.ref(run._world), weakref.ref(run._cloud)]
+    gc.disable()
+    try:
+        del run
+        assert [end() for end in ends] == [None] * 3
+    finally:
+        gc.enable()
