@@ -79,12 +79,13 @@ def assess(
     digest = None if recording.note else recording.sha256
     # A plug-in in flight comes before a metric.
     first = next(filter(None, [*recording["/fault"]["traceback"], traceback]), None)
-    judged = verdict, operator, kept, digest, first
-    return Assessment(run, experiment, flight, numbers, *judged, about)
+    return Assessment(
+        run, experiment, flight, numbers, verdict, operator, kept, digest, first, about
+    )
 
 
 def _remarks(flight: Flight, experiment: ResolvedExperiment) -> Iterator[str]:
-    """Yield what a reader of the numbers has to know about the robot, cloud and the scene."""
+    """Yield what a reader of the numbers has to know about robot, cloud, faults and scene."""
     robot, scene = PurePath(experiment.world.robot), flight.scene
     if robot.suffix == ".xml":
         yield (

@@ -104,8 +104,9 @@ class Mpc(Controller):
 
     def plan(self, model: Model, goals: Goals, dt: float) -> Planned:
         """Compute the velocities from now on; `dt` is the time since the last command [s]."""
-        present, first, yaw_rate = self._present(dt), goals(0.0), 0.0
+        present = self._present(dt)
         states, orientation = _coast(model, present)
+        first, yaw_rate = goals(0.0), 0.0
         if first.turns:
             yaw_rate = GAIN_YAW * turn_to(first.yaw, orientation)
         positions, velocities = states[:, :3], states[:, 3:]
