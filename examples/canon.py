@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 import cloudrc.link
 from cloudrc.gym import Networked
-from cloudrc.metrics.age import describe, sawtooth
+from cloudrc.results.metrics.age import describe, sawtooth
 
 Floats = NDArray[np.float64]
 Found = tuple[float, Floats]  # the exact value, and a measurement per run, shape (runs,)

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.gym.executors.newest import Newest
+from cloudrc.plugin import Newest
 
 
 class SendOnDelta(Newest):

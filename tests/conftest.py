@@ -15,11 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.main import main
+from cloudrc.base.outside.document import write_yaml
+from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.config.shipped import file_of
-from cloudrc.outside.document import write_yaml
-from cloudrc.outside.reuse import reuse_results
-from cloudrc.runs.interrupts import forget_interrupt
+from cloudrc.doors.cli.main import main
+from cloudrc.flight.runs.interrupts import forget_interrupt
 from tests.support.sweeps import GRID, SHORT
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -225,7 +225,7 @@ def refused(call):
 @pytest.fixture
 def one_core(monkeypatch):
     """Fly in this process, where a test may replace parts of a flight."""
-    monkeypatch.setattr("cloudrc.trials.workers.usable_cores", lambda: 1)
+    monkeypatch.setattr("cloudrc.flight.trials.workers.usable_cores", lambda: 1)
 
 
 @pytest.fixture
@@ -235,7 +235,7 @@ def no_page(monkeypatch):
     def draw(folder, *assessment, **wanted):
         (folder / "report.html").write_text("drawn elsewhere")
 
-    monkeypatch.setattr("cloudrc.report.write._draw", draw)
+    monkeypatch.setattr("cloudrc.results.report.write._draw", draw)
 
 
 @pytest.fixture(scope="session")

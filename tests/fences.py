@@ -2,7 +2,7 @@
 
 """The fence of the shipped scenes."""
 
-from cloudrc.geometry.obstacles import fence_of
-from cloudrc.geometry.scene import load_scene
+from cloudrc.physics.geometry.obstacles import fence_of
+from cloudrc.physics.geometry.scene import load_scene
 
 FENCE = fence_of(load_scene("pipes"))

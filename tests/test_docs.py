@@ -8,8 +8,8 @@ from typing import get_args
 
 import pytest
 
-from cloudrc.metrics.verdict import FailureCode
-from cloudrc.record.topics import TOPICS
+from cloudrc.results.metrics.verdict import FailureCode
+from cloudrc.results.record.topics import TOPICS
 from tests.support.commands import python
 from tools import docs
 from tools.site import contents, dead_links, prepare, relinked, write_plain

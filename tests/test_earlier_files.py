@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloudrc.record.columns import Recording
+from cloudrc.results.record.columns import Recording
 
 OLD = Path(__file__).parent / "fixtures" / "0.1.0"
 """A recording and a sweep. From the release of 0.1.0 on they stay as they are, and every later

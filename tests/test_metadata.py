@@ -20,7 +20,7 @@ PROJECT = {
     "description": "a testbed",
     "requires-python": ">=3.11",
     "dependencies": ["numpy>=1.26", "prometheus-client>=0.20"],
-    "scripts": {"cloudrc": "cloudrc.cli.main:main"},
+    "scripts": {"cloudrc": "cloudrc.doors.cli.main:main"},
 }
 ADA = {
     "given-names": "Ada",
@@ -84,7 +84,7 @@ def test_the_recipe_asks_for_what_pyproject_asks_for():
     recipe = metadata.recipe(read("CITATION.cff"), PROJECT)
     run = recipe["requirements"]["run"]
     assert run == ["python >=3.11", "numpy >=1.26", "prometheus_client >=0.20"]
-    assert recipe["build"]["python"]["entry_points"] == ["cloudrc = cloudrc.cli.main:main"]
+    assert recipe["build"]["python"]["entry_points"] == ["cloudrc = cloudrc.doors.cli.main:main"]
 
 
 def test_the_paper_cites_what_its_bibliography_has():

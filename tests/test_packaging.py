@@ -193,7 +193,7 @@ def test_the_wheel_alone_lists_then_flies_and_hands_out_the_exercise(built, tmp_
 
 BASE = """
 import importlib.util, sys
-from cloudrc.runs.requirements import EXTRAS
+from cloudrc.flight.runs.requirements import EXTRAS
 
 gone = {module for modules in EXTRAS.values() for module in modules}
 found = importlib.util.find_spec
@@ -207,8 +207,8 @@ sys.meta_path.insert(0, Absent())
 importlib.util.find_spec = lambda name: None if name in gone else found(name)
 
 import cloudrc
-from cloudrc.cli.main import main
-from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.doors.cli.main import main
+from cloudrc.base.errors import MissingPrerequisiteError
 
 assert main(["list", "metrics"]) == 0
 for words in (["sweep", "status", "runs"], ["sweep", "run", "s.yaml"], ["down"]):

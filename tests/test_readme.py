@@ -44,8 +44,8 @@ REFUSED = [
 ]
 """Commands that cloudrc refuses, with what it prints."""
 UNTESTED = {"", "make test", "make live", ".venv/bin/cloudrc up --console"}
-"""Lines that are not run here: steps of .ci/run, and one that tests/console tests, because it runs
-until Ctrl-C."""
+"""Lines that are not run here: steps of .ci/run, and one that tests/doors/console tests, because it
+runs until Ctrl-C."""
 COMMANDS = [line for line in LINES if line not in UNTESTED]
 ANSWERS = {"compare": "B has a lower", "margin": "settles up to", "capacity": "runs/capacity"}
 """Subcommand with many flights -> beginning of the last line that it prints."""

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from cloudrc.statistics import median_interval
+from cloudrc.base.statistics import median_interval
 from tests.conftest import nightly, nightly_rows
 from tests.flights.conftest import both_ways, fly, numbers
 from tools.results import PAGE, results

@@ -37,7 +37,7 @@ def test_a_flight_in_real_time_uses_nothing_that_macos_lacks(tmp_path):
 
 
 def test_windows_is_sent_to_wsl2():
-    program = "import sys; sys.platform = 'win32'; import cloudrc.cli.main"
+    program = "import sys; sys.platform = 'win32'; import cloudrc.doors.cli.main"
     found = python("-c", program)
     assert (found.returncode, found.stderr.count("\n")) == (3, 1)
     assert "WSL2" in found.stderr

@@ -32,9 +32,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from cloudrc.base.text import table
+from cloudrc.flight.runs.bench import FLIGHTS, STEPS
 from cloudrc.gym import Channel, Networked
-from cloudrc.runs.bench import FLIGHTS, STEPS
-from cloudrc.text import table
 
 ROOT = Path(__file__).parents[1]
 FLIGHTS_MIN = 12

@@ -25,10 +25,10 @@ from multiprocessing import Process
 from pathlib import Path
 from random import Random
 
-from cloudrc.drivers.machine import interpreter
-from cloudrc.drivers.realtime import free_ports
-from cloudrc.text import table
-from cloudrc.tunnel.codec import SIZES, Kind, encode_header, peek
+from cloudrc.base.text import table
+from cloudrc.flight.drivers.machine import interpreter
+from cloudrc.flight.drivers.realtime import free_ports
+from cloudrc.wire.tunnel.codec import SIZES, Kind, encode_header, peek
 
 EXPERIMENT = """\
 world: {{scene: empty}}

@@ -25,19 +25,30 @@ from typing import Any
 
 LIMIT_NS = 300_000_000_000
 """Time limit of a flight of the part "loop" [ns], virtual time."""
-FLY_POINT = "cloudrc.runs.flight", "cloudrc.sweep.flight"
-"""Modules that may have `fly_point`."""
-WORKERS = "cloudrc.trials.workers"
-"""Module that may have `map_in_order`; earlier, a worker called `fly_point` and no more."""
+FLY_POINT = "cloudrc.flight.runs.flight", "cloudrc.runs.flight"
+WORKERS = "cloudrc.flight.trials.workers", "cloudrc.trials.workers"
+VIRTUAL = "cloudrc.flight.drivers.virtual", "cloudrc.drivers.virtual"
+ASSEMBLY = "cloudrc.flight.assembly", "cloudrc.assembly"
+"""Where the modules that fly are today, and where they were in older commits."""
 marks: list[float] = []
 """Processor time of this thread when the flight began, and every 100 ms of virtual time [s]."""
 
 
+def load_module(names: tuple[str, ...]) -> Any:
+    """Import the first of some modules that is there."""
+    for name in names:
+        try:
+            return import_module(name)
+        except ModuleNotFoundError as error:
+            if not name.startswith(f"{error.name}"):
+                raise
+    raise ModuleNotFoundError(" and ".join(names))
+
+
 def note_pieces() -> None:
     """Let every flight in virtual time note when a piece of it ends."""
-    from cloudrc.drivers.virtual import VirtualRun
-
-    fly = VirtualRun.fly
+    run = load_module(VIRTUAL).VirtualRun
+    fly = run.fly
 
     def fly_noted(self: Any, until: Any, limit_ns: int, sink: Any) -> None:
         def noted(*records: Any) -> None:
@@ -47,7 +58,7 @@ def note_pieces() -> None:
         marks.append(time.thread_time())
         fly(self, until, limit_ns, noted)
 
-    VirtualRun.fly = fly_noted  # type: ignore[method-assign]
+    run.fly = fly_noted
 
 
 @cache
@@ -60,32 +71,20 @@ def load(experiment: str, settings: tuple[str, ...]) -> Any:
 
 def fly_point(experiment: Any) -> str:
     """Fly as a sweep does; return the hash of the records, or the reason for none."""
-    for name in FLY_POINT:
-        try:
-            module = import_module(name)
-        except ModuleNotFoundError:
-            continue
-        row = module.fly_point(experiment)
-        return str(row["records_sha256"] or row)
-    raise ModuleNotFoundError(" and ".join(FLY_POINT))
+    row = load_module(FLY_POINT).fly_point(experiment)
+    return str(row["records_sha256"] or row)
 
 
 @cache
 def flights(experiment: str, settings: tuple[str, ...]) -> Iterator[str]:
     """Yield the hash of one flight after the other, as a worker of a sweep flies them."""
     again = repeat(load(experiment, settings))
-    try:
-        workers = import_module(WORKERS)
-    except ModuleNotFoundError:
-        return map(fly_point, again)
-    return workers.map_in_order(fly_point, again, 1)  # type: ignore[no-any-return]
+    return load_module(WORKERS).map_in_order(fly_point, again, 1)  # type: ignore[no-any-return]
 
 
 def fly_loop(experiment: Any) -> None:
     """Fly, and keep the records in memory."""
-    from cloudrc.assembly import assemble
-
-    _, _, teleop, run, *_ = assemble(experiment)
+    _, _, teleop, run, *_ = load_module(ASSEMBLY).assemble(experiment)
     records: list[Any] = []
 
     def sink(*new: list[Any]) -> None:

@@ -13,10 +13,10 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-from cloudrc.assembly import assemble
 from cloudrc.config.load import load_experiment
-from cloudrc.runs.bench import flight
-from cloudrc.warnings import advise
+from cloudrc.flight.assembly import assemble
+from cloudrc.flight.runs.bench import flight
+from cloudrc.flight.warnings import advise
 
 
 def count(

@@ -4,11 +4,11 @@
 
 The tables of docs/experiment.md come from the models in `cloudrc/config/schema.py` and from the
 signatures of the shipped plug-ins. The tables of docs/topics.md come from
-`cloudrc/record/topics.py`, those of docs/metrics.md from `cloudrc/exposition/table.py`. The text
-around the tables is written by hand. `QUANTITIES` gives panels to the dashboard of missions. The
-table of docs/on-call.md comes from the chart's `files/rules.yaml`, those of
-docs/reference/faults.md from the marks of the tests that inject faults. The menu of the site is the
-list of pages in docs/README.md.
+`cloudrc/results/record/topics.py`, those of docs/metrics.md from
+`cloudrc/results/exposition/table.py`. The text around the tables is written by hand. `QUANTITIES`
+gives panels to the dashboard of missions. The table of docs/on-call.md comes from the chart's
+`files/rules.yaml`, those of docs/reference/faults.md from the marks of the tests that inject
+faults. The menu of the site is the list of pages in docs/README.md.
 
 Each shipped robot and mission has a page of its own (`tools/guests.py`).
 
@@ -28,18 +28,18 @@ from typing import Any
 import yaml
 from pydantic import BaseModel
 
-from cloudrc import plugins
+from cloudrc.base import plugins
+from cloudrc.base.outside.values import to_plain
 from cloudrc.config import shipped
 from cloudrc.config.keys import forms, keys_of, unit_in
 from cloudrc.config.overrides import KINDS, default_parameters
 from cloudrc.config.profile import DirectionConfig, Profile
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import Experiment, MissionConfig
-from cloudrc.exposition.table import METRICS, ROLES
-from cloudrc.metrics.definitions import QUANTITIES, RecordQuantity
-from cloudrc.outside.values import to_plain
-from cloudrc.record.topics import TOPICS
-from tools import faults, metadata, ranking
+from cloudrc.results.exposition.table import METRICS, ROLES
+from cloudrc.results.metrics.definitions import QUANTITIES, RecordQuantity
+from cloudrc.results.record.topics import TOPICS
+from tools import faults, metadata, ranking, wings
 from tools.chart_values import added, earliest, make_schema, table_rows
 from tools.dashboards import UNITS
 from tools.guests import OWN_FLIGHTS, link, pages
@@ -152,6 +152,8 @@ def outputs() -> dict[Path, str]:
         **insert(ROOT / "docs" / "on-call.md", f"\n{_alerts()}"),
         **insert(ROOT / "docs" / "reference" / "faults.md", _faults()),
         **pages(),
+        **insert(ROOT / "docs" / "architecture.md", f"\n{wings.listed()}\n"),
+        wings.PICTURE: wings.picture(),
         **ranking.outputs(),
         **insert(CHART / "README.md", f"\n{rows}"),
         **insert(ROOT / "mkdocs.yml", f"{_navigation()}# "),

@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from cloudrc.base.outside.document import read_document
 from cloudrc.config import shipped
 from cloudrc.config.problems import validate
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, find_robot
 from cloudrc.config.schema import MissionConfig, World
-from cloudrc.outside.document import read_document
 from cloudrc.robots.build import build_robot
 from cloudrc.robots.check import SCENE, read_facts
 from tools.markdown import table
@@ -126,7 +126,7 @@ def _mission(name: str) -> str:
             *([points] if mission.waypoints else []),
             "## Limits\n",
             table("limit | value", _conditions(mission)),
-            f"Its file: [{name}.yaml](../../cloudrc/missions/{name}.yaml). "
+            f"Its file: [{name}.yaml](../../cloudrc/config/missions/{name}.yaml). "
             "A mission of your own: [scene.md](../scene.md).\n",
         ]
     )

@@ -18,9 +18,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from cloudrc.base.text import table
+from cloudrc.flight.trials.rows import Row, read_rows
 from cloudrc.studies.sweep import read_summary
-from cloudrc.text import table
-from cloudrc.trials.rows import Row, read_rows
 
 LONGER_MAX = {"moonshot": 0.01, "moonshot-disturbed": 0.02}
 """Folder of a sweep -> by how much a mission may take longer than without a delay."""

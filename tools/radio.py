@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 import cloudrc.link
-from cloudrc.report.figures import own_settings, save
-from cloudrc.report.figures.style import Look, dots, legend_above, new_figure, panel
-from cloudrc.statistics import median_interval
+from cloudrc.base.statistics import median_interval
+from cloudrc.results.report.figures import own_settings, save
+from cloudrc.results.report.figures.style import Look, dots, legend_above, new_figure, panel
 from tools.markdown import table
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

@@ -8,10 +8,10 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from cloudrc.rank.entry import read_entry
-from cloudrc.rank.page import make_page
-from cloudrc.rank.score import in_order
-from cloudrc.rank.tasks import GRID
+from cloudrc.studies.rank.entry import read_entry
+from cloudrc.studies.rank.page import make_page
+from cloudrc.studies.rank.score import in_order
+from cloudrc.studies.rank.tasks import GRID
 from tools.markdown import table
 
 ROOT = Path(__file__).resolve().parents[1]

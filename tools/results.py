@@ -17,8 +17,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cloudrc.reproduce.table import as_markdown, summary
-from cloudrc.statistics import median_interval
+from cloudrc.base.statistics import median_interval
+from cloudrc.studies.reproduce.table import as_markdown, summary
 from tools.docs import insert
 from tools.markdown import table
 

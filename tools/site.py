@@ -24,7 +24,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import SplitResult, unquote, urlsplit
 
-from cloudrc.cli.parser import COMMANDS, build_parser
+from cloudrc.doors.cli.parser import COMMANDS, build_parser
 from tools.api import PAGE, public_names
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The remote controller in the cloud: it turns the robot's telemetry into velocity commands.
+"""The remote end: it turns the robot's telemetry into velocity commands.
 
 The signal passes through three plug-ins. The operator gives the setpoint:
 

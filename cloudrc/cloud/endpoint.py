@@ -16,6 +16,7 @@ from collections.abc import Callable
 from math import nan
 from typing import Any
 
+from cloudrc.base.errors import ControllerLostError
 from cloudrc.cloud.compute_time import ComputeTime
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import (
@@ -27,8 +28,7 @@ from cloudrc.cloud.operator import (
 from cloudrc.cloud.perceiving import Perceiver
 from cloudrc.cloud.receiving import FrameReceiver
 from cloudrc.cloud.sight import KINDS, Sight
-from cloudrc.errors import ControllerLostError
-from cloudrc.messages import (
+from cloudrc.wire.messages import (
     NEVER_NS,
     Datagram,
     GuardState,
@@ -37,7 +37,7 @@ from cloudrc.messages import (
     Setpoint,
     Telemetry,
 )
-from cloudrc.records import (
+from cloudrc.wire.records import (
     UNDER_WAY,
     Arrival,
     Control,
@@ -46,12 +46,12 @@ from cloudrc.records import (
     MissionEvent,
     SessionOpened,
 )
-from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import LATE, REPEATED, USED
-from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
-from cloudrc.tunnel.end import Identity, TunnelEnd
-from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake
-from cloudrc.tunnel.session import NO_EPOCH
+from cloudrc.wire.tunnel import codec
+from cloudrc.wire.tunnel.channel import LATE, REPEATED, USED
+from cloudrc.wire.tunnel.codec import Accept, DecodeError, Direction, Kind
+from cloudrc.wire.tunnel.end import Identity, TunnelEnd
+from cloudrc.wire.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake
+from cloudrc.wire.tunnel.session import NO_EPOCH
 
 LATE_NS, LATE_WINDOW_NS = 500_000_000, 10_000_000_000
 """Cloud reports a fault, once per session, if the periods that it misses within LATE_WINDOW_NS add

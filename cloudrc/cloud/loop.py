@@ -26,6 +26,9 @@ from itertools import chain
 from math import nan
 from typing import TYPE_CHECKING, Any
 
+from cloudrc.base.errors import ControllerLostError, describe_error
+from cloudrc.base.outside.code import FAILURES, calling, check_failure, locate, stack_of
+from cloudrc.base.outside.values import RESULT, InvalidValueError
 from cloudrc.cloud.controllers import STAND_STILL, Controller, ControlOutput
 from cloudrc.cloud.controllers.pid import Law, Pid
 from cloudrc.cloud.estimators import DelaySample, Estimator
@@ -41,8 +44,8 @@ from cloudrc.cloud.results import (
     to_vector,
     to_vectors,
 )
-from cloudrc.errors import ControllerLostError, describe_error
-from cloudrc.messages import (
+from cloudrc.teleop.carrot import path_of
+from cloudrc.wire.messages import (
     FRESH_ECHO_PERIODS,
     NEVER_NS,
     PLAN_STEP_NS,
@@ -54,11 +57,8 @@ from cloudrc.messages import (
     Vector,
     plan_length,
 )
-from cloudrc.outside.code import FAILURES, calling, check_failure, locate, stack_of
-from cloudrc.outside.values import RESULT, InvalidValueError
-from cloudrc.records import PLUG_IN_FAILED, UNSENT, Control, Fault, PlugInKind
-from cloudrc.teleop.carrot import path_of
-from cloudrc.tunnel.codec import as_planned
+from cloudrc.wire.records import PLUG_IN_FAILED, UNSENT, Control, Fault, PlugInKind
+from cloudrc.wire.tunnel.codec import as_planned
 
 if TYPE_CHECKING:
     import numpy as np

@@ -10,7 +10,7 @@ from struct import Struct
 from typing import TYPE_CHECKING, Self
 
 from cloudrc.cloud.predictors import Model, moved
-from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
+from cloudrc.wire.messages import ZERO, Odometry, Setpoint, Vector
 
 if TYPE_CHECKING:
     from cloudrc.cloud.controllers.pid import Law

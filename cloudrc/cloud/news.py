@@ -12,7 +12,7 @@ Source: M. Miskowicz, "Send-on-delta concept: an event-based data reporting stra
 
 from __future__ import annotations
 
-from cloudrc.messages import PLAN_STEP_NS, Command, GuardState, plan_length
+from cloudrc.wire.messages import PLAN_STEP_NS, Command, GuardState, plan_length
 
 HOLD = GuardState.HOLD  # looking up a member of an enum is slow
 

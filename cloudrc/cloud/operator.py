@@ -7,7 +7,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from cloudrc.messages import (
+from cloudrc.teleop.wire import Output, RobotStatus
+from cloudrc.wire.messages import (
     NEVER_NS,
     GuardState,
     OperatorRequest,
@@ -15,9 +16,8 @@ from cloudrc.messages import (
     Setpoint,
     Telemetry,
 )
-from cloudrc.records import Control, Fault
-from cloudrc.teleop.wire import Output, RobotStatus
-from cloudrc.tunnel.session import NO_EPOCH
+from cloudrc.wire.records import Control, Fault
+from cloudrc.wire.tunnel.session import NO_EPOCH
 
 REPEAT_NS = 10_000_000
 """Time between two copies of an emergency stop [ns]. It is short, so that a link with losses delays

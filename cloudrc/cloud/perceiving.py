@@ -19,17 +19,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cloudrc.base.outside.code import attempt
+from cloudrc.base.outside.values import RESULT, InvalidValueError, shorten
 from cloudrc.cloud.compute_time import ComputeTime
 from cloudrc.cloud.perceptions import Frame, Perception, Scan, Seen
 from cloudrc.cloud.results import to_vector
-from cloudrc.endpoint import Outcome, Worker
-from cloudrc.geometry.fence import Fence
-from cloudrc.geometry.rays import ranges_of
-from cloudrc.messages import Odometry, RangeScan, Setpoint, Vector
-from cloudrc.outside.code import attempt
-from cloudrc.outside.values import RESULT, InvalidValueError, shorten
-from cloudrc.records import UNSENT, Perceived
-from cloudrc.tunnel.session import NO_EPOCH
+from cloudrc.physics.geometry.fence import Fence
+from cloudrc.physics.geometry.rays import ranges_of
+from cloudrc.wire.endpoint import Outcome, Worker
+from cloudrc.wire.messages import Odometry, RangeScan, Setpoint, Vector
+from cloudrc.wire.records import UNSENT, Perceived
+from cloudrc.wire.tunnel.session import NO_EPOCH
 
 HISTORY_NS = 2_000_000_000
 """Time for which odometry is kept, to find that of the time at which a scan was taken [ns]."""

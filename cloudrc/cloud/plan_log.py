@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cloudrc.messages import PLAN_STEP_NS, Command, GuardState, Telemetry, Vector
-from cloudrc.records import PlanFollowed
+from cloudrc.wire.messages import PLAN_STEP_NS, Command, GuardState, Telemetry, Vector
+from cloudrc.wire.records import PlanFollowed
 
 TRACK = GuardState.TRACK  # looking up a member of an enum is slow
 

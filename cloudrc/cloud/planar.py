@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from cloudrc.base.errors import ControllerLostError
+from cloudrc.base.outside.values import InvalidValueError
 from cloudrc.cloud.controllers import Controller, ControlOutput, Goals, Planned
 from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.cloud.predictors import Model
 from cloudrc.cloud.results import check_output, is_ours
-from cloudrc.errors import ControllerLostError
-from cloudrc.messages import Odometry, Setpoint
-from cloudrc.outside.values import InvalidValueError
-from cloudrc.records import CONTROLLER_LOST
+from cloudrc.wire.messages import Odometry, Setpoint
+from cloudrc.wire.records import CONTROLLER_LOST
 
 ROUNDING = 1e-9
 """Largest vertical velocity that counts as 0 [m/s]."""

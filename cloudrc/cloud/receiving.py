@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from cloudrc.cloud.perceptions import Frame
-from cloudrc.messages import FramePiece
-from cloudrc.pictures import Decoder, Image
-from cloudrc.records import FrameKept, FrameShown
+from cloudrc.wire.messages import FramePiece
+from cloudrc.wire.pictures import Decoder, Image
+from cloudrc.wire.records import FrameKept, FrameShown
 
 WINDOW = 64
 """Number of pictures by which one may be older than the newest before it is given up."""

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from math import sqrt
 from typing import TYPE_CHECKING, Any
 
+from cloudrc.base.outside.values import RESULT, WHOLE, InvalidValueError, shorten
 from cloudrc.cloud.controllers import ControlOutput
-from cloudrc.messages import Odometry, Vector
-from cloudrc.outside.values import RESULT, WHOLE, InvalidValueError, shorten
+from cloudrc.wire.messages import Odometry, Vector
 
 if TYPE_CHECKING:
     import numpy as np

@@ -11,11 +11,11 @@ from typing import Any
 from cloudrc.cloud.perceiving import Perceiver
 from cloudrc.cloud.perceptions import Frame
 from cloudrc.cloud.receiving import FrameReceiver
-from cloudrc.messages import RangeScan
-from cloudrc.records import Record
-from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import USED, ReceiveWindow
-from cloudrc.tunnel.codec import Kind
+from cloudrc.wire.messages import RangeScan
+from cloudrc.wire.records import Record
+from cloudrc.wire.tunnel import codec
+from cloudrc.wire.tunnel.channel import USED, ReceiveWindow
+from cloudrc.wire.tunnel.codec import Kind
 
 KINDS = frozenset((int(Kind.SCAN), int(Kind.FRAME)))
 """Kinds of datagrams with what the robot sees."""

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Work with a release of the chart on Kubernetes: install it, fly missions, fetch recordings."""
+"""A release of the chart on Kubernetes: install it, fly missions, fetch recordings."""
 
 DEFAULT_RELEASE = "cloudrc"
 """Name of a Helm release that nobody has named."""

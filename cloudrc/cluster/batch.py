@@ -16,6 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import yaml
 
+from cloudrc.base.errors import RejectedError, to_one_line
+from cloudrc.base.outside.document import KeyPath
+from cloudrc.base.text import suggest_name
 from cloudrc.cluster.client import ClusterError, NoAnswerError, Release, chart_folder
 from cloudrc.cluster.jobs import (
     JobReader,
@@ -26,9 +29,6 @@ from cloudrc.cluster.jobs import (
     read_example,
 )
 from cloudrc.config.problems import problem_at
-from cloudrc.errors import RejectedError, to_one_line
-from cloudrc.outside.document import KeyPath
-from cloudrc.text import suggest_name
 
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment

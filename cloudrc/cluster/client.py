@@ -19,8 +19,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
+from cloudrc.base.errors import CloudrcError, MissingPrerequisiteError, TimedOutError, to_one_line
 from cloudrc.cluster import DEFAULT_RELEASE
-from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError, to_one_line
 
 COMPONENTS = ("world", "cloud")
 """Components of a release that have a pod of their own."""

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
+from cloudrc.base.errors import to_one_line
+from cloudrc.base.outside.prometheus import Metrics, total
 from cloudrc.cluster.client import COMPONENTS, Release
 from cloudrc.cluster.pods import (
     VALUES,
@@ -18,8 +20,6 @@ from cloudrc.cluster.pods import (
     describe_end,
     pod_failure,
 )
-from cloudrc.errors import to_one_line
-from cloudrc.outside.prometheus import Metrics, total
 
 MISSING = ("not found", "non-existent")
 """Words of Kubernetes about a volume, such as a Secret, that somebody has to make."""

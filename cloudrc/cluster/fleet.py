@@ -9,11 +9,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 
+from cloudrc.base.errors import CloudrcError
+from cloudrc.base.text import table
 from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.cluster.missions import release_api
 from cloudrc.cluster.releases import look
-from cloudrc.errors import CloudrcError
-from cloudrc.text import table
 
 AT_ONCE = 8
 """Number of releases that are asked for their mission at the same time."""

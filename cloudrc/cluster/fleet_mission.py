@@ -15,6 +15,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from cloudrc.base.errors import CloudrcError
+from cloudrc.base.outside.prometheus import Metrics, read_metrics, total
 from cloudrc.cluster.client import ClusterError, Release, run
 from cloudrc.cluster.jobs import AT, KILLED_WATCHER, Ended, JobReader, read_end
 from cloudrc.cluster.pods import (
@@ -26,8 +28,6 @@ from cloudrc.cluster.pods import (
     list_pods,
     read_page,
 )
-from cloudrc.errors import CloudrcError
-from cloudrc.outside.prometheus import Metrics, read_metrics, total
 
 if TYPE_CHECKING:
     from cloudrc.link.cell import Usage
@@ -50,7 +50,7 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
     At the end, `tell` receives the summary that `cloudrc run` prints of a fleet. The exit code is
     the largest of all robots.
     """
-    from cloudrc.report.fleet import summarize_fleet
+    from cloudrc.results.report.fleet import summarize_fleet
 
     before = _read_robots(release)
     job = release.request("get", "jobs", name=name)
@@ -88,7 +88,7 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
 
 def _verdict(end: Ended) -> dict[str, str]:
     """Return the verdict of a robot and the codes of its failures."""
-    from cloudrc.metrics.verdict import EXIT_CODES
+    from cloudrc.results.metrics.verdict import EXIT_CODES
 
     named = {code: verdict for verdict, code in EXIT_CODES.items()}
     why = {"why": ", ".join(end.codes)} if end.codes else {}
@@ -108,7 +108,7 @@ def _document(rows: list[dict[str, Any]], record: list[Usage], start: float) -> 
 
     What the cell did after `start` [s] is its flight: all of it, if the cell has a new pod.
     """
-    from cloudrc.report.fleet import cell_rows, judge_robots
+    from cloudrc.results.report.fleet import cell_rows, judge_robots
 
     if record and record[-1].time_s < start:
         start = 0.0

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cloudrc.base.errors import CloudrcError, InterruptedRunError, TimedOutError
 from cloudrc.cluster import pods
 from cloudrc.cluster.client import (
     COMPONENTS,
@@ -39,13 +40,12 @@ from cloudrc.cluster.jobs import (
 )
 from cloudrc.cluster.missions import release_api, settle_mission
 from cloudrc.cluster.own_files import find_own_files, give_to_release, send_own_files
-from cloudrc.errors import CloudrcError, InterruptedRunError, TimedOutError
 from cloudrc.teleop.client import Api, find_mission
 from cloudrc.version import __version__
 
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
-    from cloudrc.record.columns import Recording
+    from cloudrc.results.record.columns import Recording
 
 Tell = Callable[[str], None]
 
@@ -315,7 +315,7 @@ def fetch_all(
     `tell` receives the error. With `want_end`, fetch the recordings again until they contain the
     end of the mission.
     """
-    from cloudrc.record.merge import cut_to_last_mission, merge
+    from cloudrc.results.record.merge import cut_to_last_mission, merge
 
     for left in reversed(range(FETCHES)):
         time.sleep(FLUSH)
@@ -355,9 +355,9 @@ def report_flight(
     `interrupted` says whether the flight was cut short; `page` and `figures` are those of
     `write_report`.
     """
-    from cloudrc.report.document import Run
-    from cloudrc.report.views import views
-    from cloudrc.report.write import attachments, write_report
+    from cloudrc.results.report.document import Run
+    from cloudrc.results.report.views import views
+    from cloudrc.results.report.write import attachments, write_report
 
     try:
         shaper = "+".join(sorted(set(mission["/link"]["shaper"]))) or "unknown"

@@ -9,6 +9,8 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from cloudrc.base.errors import to_one_line
+from cloudrc.base.outside.prometheus import Metrics, read_metrics, total
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, run
 from cloudrc.cluster.diagnosis import (
     LOOK_UP,
@@ -26,8 +28,6 @@ from cloudrc.cluster.pods import (
     read_page,
     workloads,
 )
-from cloudrc.errors import to_one_line
-from cloudrc.outside.prometheus import Metrics, read_metrics, total
 
 WINDOW = 2.5
 """Time between two looks at the metrics [s], whose counters are updated once a second."""

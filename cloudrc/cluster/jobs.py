@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from cloudrc.base.errors import TimedOutError, to_one_line
 from cloudrc.cluster.client import ClusterError, NotFoundError, Release, chart_folder
 from cloudrc.cluster.incidents import ReleaseWatch
 from cloudrc.cluster.pods import (
@@ -33,7 +34,6 @@ from cloudrc.cluster.pods import (
     pod_log,
 )
 from cloudrc.cluster.releases import COMPONENT as LABEL
-from cloudrc.errors import TimedOutError, to_one_line
 from cloudrc.teleop.client import describe_verdict
 
 COMPONENT = "mission"

@@ -16,6 +16,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+from cloudrc.base.errors import InvalidRunError, StateError
+from cloudrc.base.outside.document import parse_yaml, write_yaml
+from cloudrc.base.outside.refusal import check_names
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.flight import FETCHES, FLUSH, fetch_all, report_flight
 from cloudrc.cluster.link import EXPERIMENT
@@ -27,14 +30,11 @@ from cloudrc.config.profile import DIRECTIONS
 from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.config.robot import known_robot
 from cloudrc.config.schema import MissionConfig
-from cloudrc.errors import InvalidRunError, StateError
+from cloudrc.flight.runs.session import experiment_of
 from cloudrc.link.follow import PROFILE
-from cloudrc.outside.document import parse_yaml, write_yaml
-from cloudrc.outside.refusal import check_names
-from cloudrc.record.columns import Recording
-from cloudrc.record.merge import cut_to_last_mission, merge
-from cloudrc.report.document import ENVIRONMENT_FILE
-from cloudrc.runs.session import experiment_of
+from cloudrc.results.record.columns import Recording
+from cloudrc.results.record.merge import cut_to_last_mission, merge
+from cloudrc.results.report.document import ENVIRONMENT_FILE
 from cloudrc.teleop.store import MissionRecord, open_store
 
 REPORTS = "missions"

@@ -22,6 +22,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+from cloudrc.base.errors import CloudrcError, RejectedError, TimedOutError
+from cloudrc.base.outside.document import Document, write_yaml
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, run
 from cloudrc.cluster.pods import INDEX
 from cloudrc.cluster.releases import CLOUDRC, COMPONENT, INSTANCE, no_release, several_releases
@@ -29,11 +31,9 @@ from cloudrc.config.link_edit import Edit, edit_profile
 from cloudrc.config.load import load_link
 from cloudrc.config.problems import problem_at
 from cloudrc.config.profile import DIRECTIONS, FILE_READERS
-from cloudrc.errors import CloudrcError, RejectedError, TimedOutError
 from cloudrc.link.control import APPLY_LIMIT, SOCKET, put_request, read_answer
 from cloudrc.link.follow import PROFILE
 from cloudrc.link.state import CHANGE_FILE, ChangeFacts, LinkState, write_change
-from cloudrc.outside.document import Document, write_yaml
 
 FOLDER = "/run/cloudrc"
 """Folder in a link container with the files of the link: route, state, socket."""

@@ -7,10 +7,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from cloudrc.base.errors import CloudrcError, InterruptedRunError
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.jobs import Ended
 from cloudrc.cluster.pods import API_PORT, find_pod, forwarded, operator_token
-from cloudrc.errors import CloudrcError, InterruptedRunError
 from cloudrc.teleop.client import Api, describe_mission, find_mission, mission_path
 
 

@@ -22,7 +22,7 @@ from cloudrc.config.resolved import ResolvedExperiment, local_files
 from cloudrc.config.robot import files_of, find_robot
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import ROBOT_FILE, is_path
-from cloudrc.geometry.model_files import model_files
+from cloudrc.physics.geometry.model_files import model_files
 
 SCENE_FILE = "scene.xml"
 """Key of the scene's MJCF file in its ConfigMap."""

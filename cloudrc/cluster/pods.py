@@ -21,6 +21,7 @@ from http.client import HTTPConnection
 from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
 
+from cloudrc.base.errors import StateError, TimedOutError, to_one_line
 from cloudrc.cluster.client import (
     REQUEST_TIMEOUT,
     ClusterError,
@@ -33,9 +34,8 @@ from cloudrc.cluster.client import (
     run,
 )
 from cloudrc.cluster.releases import CLOUDRC, COMPONENT, INSTANCE, no_release
-from cloudrc.drivers.machine import STOP_LIMIT, end_process
-from cloudrc.errors import StateError, TimedOutError, to_one_line
-from cloudrc.record import part_before
+from cloudrc.flight.drivers.machine import STOP_LIMIT, end_process
+from cloudrc.results.record import part_before
 
 NO_IMAGE = ("ErrImagePull", "ImagePullBackOff", "ErrImageNeverPull", "InvalidImageName")
 NOT_MADE = ("CreateContainerConfigError", "CreateContainerError", "RunContainerError")

@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from cloudrc.base.errors import BadInputError, StateError
 from cloudrc.cluster import DEFAULT_RELEASE
 from cloudrc.cluster.client import (
     ClusterError,
     Release,
     connect,
 )
-from cloudrc.errors import BadInputError, StateError
 
 INSTANCE = "app.kubernetes.io/instance"
 """Label with the name of the release."""

@@ -21,6 +21,7 @@ from typing import Any, Literal
 
 import yaml
 
+from cloudrc.base.errors import CloudrcError, to_one_line
 from cloudrc.cluster.client import (
     ClusterError,
     NotFoundError,
@@ -31,7 +32,6 @@ from cloudrc.cluster.client import (
 from cloudrc.cluster.diagnosis import DNS_REMEDY, LOOK_UP, remedy
 from cloudrc.cluster.pods import Finding, container_statuses, pod_failure
 from cloudrc.cluster.releases import COMPONENT
-from cloudrc.errors import CloudrcError, to_one_line
 
 NEEDED = {
     "": "pods services configmaps secrets serviceaccounts persistentvolumeclaims",
@@ -68,7 +68,7 @@ DEFAULT_CLASS = "storageclass.kubernetes.io/is-default-class"
 """Annotation of the StorageClass of claims that name none."""
 IN_CLUSTER = "kubernetes.default.svc"
 """A name that each cluster resolves."""
-DRAWS = "python -c 'from cloudrc.cli.doctor import draw; draw()' > /dev/termination-log"
+DRAWS = "python -c 'from cloudrc.doors.cli.doctor import draw; draw()' > /dev/termination-log"
 """Shell command of a container that tells how long it takes to draw a picture."""
 LOOKS_UP = ["python", "-I", "-S", "-c", LOOK_UP, IN_CLUSTER]
 """Command of a container that fails if it cannot resolve this name."""

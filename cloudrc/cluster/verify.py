@@ -16,14 +16,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from math import nan
 from typing import Any, TypeAlias
 
+from cloudrc.base.errors import TimedOutError
+from cloudrc.base.outside.prometheus import read_metrics
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.pods import METRICS, find_pod, forwarded
-from cloudrc.errors import TimedOutError
+from cloudrc.flight.runs.links.under_test import LOOPBACK, WAYS
+from cloudrc.flight.runs.links.verify import Report, fetch, make_report
 from cloudrc.link.verify.causes import Findings, read_evidence
 from cloudrc.link.verify.judge import Judgement
-from cloudrc.outside.prometheus import read_metrics
-from cloudrc.runs.links.under_test import LOOPBACK, WAYS
-from cloudrc.runs.links.verify import Report, fetch, make_report
 
 RELEASE_TIMEOUT = 270.0  # default time limit for the verdict on a release [s]
 POLL_PERIOD = 2.0  # between requests to a release [s]

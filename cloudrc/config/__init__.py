@@ -1,3 +1,3 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Read and check configuration files, fill in defaults, and return an immutable experiment."""
+"""What is asked: configuration files, checked and completed to an immutable experiment."""

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from cloudrc.base.outside.values import Quantity
 from cloudrc.config.section import Section
-from cloudrc.outside.values import Quantity
 
 QUALITY = Quantity(ge=1, le=95, whole=True)
 """Quality of JPEG, as Pillow counts it."""

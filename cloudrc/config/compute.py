@@ -8,13 +8,13 @@ import logging
 from collections.abc import Mapping
 from pathlib import Path
 
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.outside.reuse import reuse
+from cloudrc.base.outside.tables import MILLISECONDS, CsvTable
+from cloudrc.base.outside.values import Quantity
+from cloudrc.base.text import list_some
 from cloudrc.config.cloud import Cloud
 from cloudrc.config.problems import problem_at
-from cloudrc.errors import BadInputError
-from cloudrc.outside.reuse import reuse
-from cloudrc.outside.tables import MILLISECONDS, CsvTable
-from cloudrc.outside.values import Quantity
-from cloudrc.text import list_some
 
 _TIME = Quantity("ms", 0, 100_000)
 

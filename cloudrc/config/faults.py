@@ -2,7 +2,7 @@
 
 """Faults that an experiment injects: their keys, and what they do to the link's time line.
 
-`cloudrc.drivers.faults` injects those of processes and clocks.
+`cloudrc.flight.drivers.faults` injects those of processes and clocks.
 """
 
 from __future__ import annotations

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.geometry.clearance import Spheres
-from cloudrc.geometry.fence import Fence
-from cloudrc.geometry.moving import Moving
-from cloudrc.geometry.obstacles import fence_of
-from cloudrc.geometry.scene import Plate, Scene, Tube
-from cloudrc.geometry.solids import Solid
-from cloudrc.outside.refusal import reading
+from cloudrc.base.outside.refusal import reading
+from cloudrc.physics.geometry.clearance import Spheres
+from cloudrc.physics.geometry.fence import Fence
+from cloudrc.physics.geometry.moving import Moving
+from cloudrc.physics.geometry.obstacles import fence_of
+from cloudrc.physics.geometry.scene import Plate, Scene, Tube
+from cloudrc.physics.geometry.solids import Solid
 
 FLOWN_FILE = "geometry.json"
 """Name of the attachment of a recording."""

@@ -10,7 +10,7 @@ from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.robot import is_planar
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import GROUND, MissionConfig, Waypoint, World
-from cloudrc.geometry.scene import Scene
+from cloudrc.physics.geometry.scene import Scene
 
 SAME = 1e-6
 """Largest difference from the height of the spawn [m]."""

@@ -8,14 +8,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from cloudrc import plugins
+from cloudrc.base import plugins
+from cloudrc.base.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.base.outside.refusal import naming
+from cloudrc.base.outside.reuse import reuse
+from cloudrc.base.outside.values import RESULT
 from cloudrc.config.robot import RobotFiles, known_robot
 from cloudrc.config.shipped import ROBOT_FILE
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
-from cloudrc.geometry.clearance import Spheres, ball
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.reuse import reuse
-from cloudrc.outside.values import RESULT
+from cloudrc.physics.geometry.clearance import Spheres, ball
 
 TOLERANCE = 1e-3
 """Length by which geoms may reach out of the hull [m]: hull_m is rounded."""
@@ -46,7 +46,7 @@ def doubts(name: str) -> Iterator[str]:
         BadInputError: If the model does not compile.
         MissingPrerequisiteError: If MuJoCo is missing.
     """
-    from cloudrc.sim.bodies import reach_of
+    from cloudrc.physics.sim.bodies import reach_of
 
     robot = known_robot(name)
     if robot.hull_m is None or robot.hull_points is not None:
@@ -63,7 +63,7 @@ def _read_hull(name: str, robot: RobotFiles) -> Spheres:
         return _spheres(plugins.find("hull", robot.hull_points, look=False))
     if robot.hull_m is not None:
         return ball(robot.hull_m)
-    from cloudrc.sim.bodies import reach_of
+    from cloudrc.physics.sim.bodies import reach_of
 
     with naming(f"robot {name}"):
         return ball(reach_of(robot.model))

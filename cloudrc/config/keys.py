@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 from pydantic import BaseModel
 from pydantic.errors import PydanticInvalidForJsonSchema
 
-from cloudrc.outside.document import KeyPath
+from cloudrc.base.outside.document import KeyPath
 
 Schema: TypeAlias = dict[str, Any]
 

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.outside.document import Document
 from cloudrc.config import overrides, shipped
 from cloudrc.config.overrides import Settings
 from cloudrc.config.profile import DIRECTIONS, ChangeConfig, check_profile, load_profile
-from cloudrc.errors import BadInputError
 from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.profile import PERIOD_KEYS
-from cloudrc.outside.document import Document
 
 CHANGEABLE_KEYS = ChangeConfig.model_fields.keys() - {"at_s"}
 """Keys of a direction that an entry of its list `changes` may set."""

@@ -16,7 +16,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
-from cloudrc import plugins
+from cloudrc.base import plugins
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.outside.document import Document, KeyPath, parse_value, read_document
+from cloudrc.base.outside.reuse import reuse, reuse_results
+from cloudrc.base.outside.tables import CsvTable
 from cloudrc.config import overrides, problems, shipped
 from cloudrc.config.cloud import Cloud
 from cloudrc.config.compute import compute_times
@@ -50,11 +54,7 @@ from cloudrc.config.robot import DEFAULT_LIMITS, known_robot
 from cloudrc.config.robot import facts as facts_of
 from cloudrc.config.schema import Experiment, MissionConfig, World
 from cloudrc.config.sensors import of_other_codec, without_sensor
-from cloudrc.errors import BadInputError
 from cloudrc.link.traces import read_trace
-from cloudrc.outside.document import Document, KeyPath, parse_value, read_document
-from cloudrc.outside.reuse import reuse, reuse_results
-from cloudrc.outside.tables import CsvTable
 
 _NO_BOUNDS = Bounds(DEFAULT_LIMITS.model_copy(update={"acceleration_max_mps2": inf}), inf)
 """Bounds of a flight that is over: it had the limits that its file gives."""

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cloudrc.base.text import unknown_name_text
 from cloudrc.config.follow import Follow
 from cloudrc.config.ground import check_heights
 from cloudrc.config.heading import check_yaws
@@ -25,18 +26,17 @@ from cloudrc.config.robot import RobotFiles, known_robot
 from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.config.schema import MissionConfig, Steps, World
 from cloudrc.config.setpoints import read_setpoints
-from cloudrc.geometry.clearance import Array, Spheres
-from cloudrc.geometry.fence import Fence
-from cloudrc.geometry.obstacles import obstacles, surface
-from cloudrc.geometry.placement import (
+from cloudrc.physics.geometry.clearance import Array, Spheres
+from cloudrc.physics.geometry.fence import Fence
+from cloudrc.physics.geometry.obstacles import obstacles, surface
+from cloudrc.physics.geometry.placement import (
     CLEARANCE_MIN,
     find_crossed,
     find_overlapped,
     outside_fence,
 )
-from cloudrc.geometry.scene import FLOOR, Scene
-from cloudrc.messages import Vector
-from cloudrc.text import unknown_name_text
+from cloudrc.physics.geometry.scene import FLOOR, Scene
+from cloudrc.wire.messages import Vector
 
 _REPORTED = 20
 """Largest number of problems of one kind in an error message."""

@@ -27,7 +27,11 @@ from weakref import WeakKeyDictionary
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
-from cloudrc import plugins
+from cloudrc.base import plugins
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.outside import code
+from cloudrc.base.outside.document import Document, KeyPath, Source, child, parse_value
+from cloudrc.base.outside.reuse import reuse
 from cloudrc.config import problems, shipped
 from cloudrc.config.choice import PlugIn
 from cloudrc.config.cloud import Cloud
@@ -35,11 +39,7 @@ from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.robot import RobotFacts, known_robot, parameters
 from cloudrc.config.schema import Experiment, Steps, World
 from cloudrc.config.sensors import lacks_of
-from cloudrc.errors import BadInputError
-from cloudrc.messages import UPRIGHT, ZERO, Odometry
-from cloudrc.outside import code
-from cloudrc.outside.document import Document, KeyPath, Source, child, parse_value
-from cloudrc.outside.reuse import reuse
+from cloudrc.wire.messages import UPRIGHT, ZERO, Odometry
 
 REMOTE, ROS2 = "remote", "ros2"
 OUTSIDE = (REMOTE, ROS2)
@@ -323,9 +323,9 @@ def _try(
 def build_plugin(kind: str, choice: PlugIn, /, **offered: Any) -> Any:
     """Build a plug-in of a resolved experiment; convert its parameters to the declared types.
 
-    `kind` is a key of `cloudrc.plugins.PACKAGES`, such as "controllers". Its `build` gets those
-    arguments of `offered`, which are no parameters of the user, that it has. Raise a BadInputError
-    that names the wrong parameters.
+    `kind` is a key of `plugins.PACKAGES`, such as "controllers". Its `build` gets those arguments
+    of `offered`, which are no parameters of the user, that it has. Raise a BadInputError that names
+    the wrong parameters.
     """
     return _build(kind, choice.name, _check(kind, choice.name, choice.model_extra or {}), offered)
 

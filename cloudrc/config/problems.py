@@ -16,10 +16,10 @@ from typing import Any, NamedTuple, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.outside.document import Document, KeyPath
+from cloudrc.base.outside.values import shorten
 from cloudrc.config.keys import known_at, unit_at, unit_in
-from cloudrc.errors import BadInputError
-from cloudrc.outside.document import Document, KeyPath
-from cloudrc.outside.values import shorten
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _LISTED = 50

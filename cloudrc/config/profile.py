@@ -13,10 +13,12 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.outside.document import Document, KeyPath
+from cloudrc.base.outside.reuse import reuse
 from cloudrc.config import problems, shipped
 from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.section import Section, leave_out_unset
-from cloudrc.errors import BadInputError
 from cloudrc.link.profile import CLOUD_TIME_MAX as CLOUD_TIME_MAX
 from cloudrc.link.profile import COMMAND_AGE_MS as COMMAND_AGE_MS
 from cloudrc.link.profile import DIRECTIONS as DIRECTIONS
@@ -35,8 +37,6 @@ from cloudrc.link.profile import (
 from cloudrc.link.profile import CloudTime as CloudTime
 from cloudrc.link.profile import CommandAge as CommandAge
 from cloudrc.link.traces import read_opportunities, read_table, read_trace
-from cloudrc.outside.document import Document, KeyPath
-from cloudrc.outside.reuse import reuse
 
 FILE_READERS: dict[str, Callable[[Path], object]] = {
     "trace": read_trace,

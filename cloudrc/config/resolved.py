@@ -17,6 +17,7 @@ from pydantic import (
     model_validator,
 )
 
+from cloudrc.base.outside.document import write_yaml
 from cloudrc.config.choice import PlugIn
 from cloudrc.config.cloud import Cloud
 from cloudrc.config.faults import OF_LINK, acting, refusal, with_faults
@@ -33,8 +34,7 @@ from cloudrc.config.schema import (
     Speed,
     World,
 )
-from cloudrc.geometry.obstacles import fence_of
-from cloudrc.outside.document import write_yaml
+from cloudrc.physics.geometry.obstacles import fence_of
 
 HORIZON_MAX_S = 1.0
 """Default of cloud.horizon_max_s [s]. Source: docs/reference/control.md, "Predictors"."""

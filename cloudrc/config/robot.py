@@ -14,6 +14,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
+from cloudrc.base.outside.document import read_document
+from cloudrc.base.outside.refusal import check_names
+from cloudrc.base.outside.reuse import reuse
+from cloudrc.base.plugins import is_path
 from cloudrc.config import shipped
 from cloudrc.config.camera import CameraConfig
 from cloudrc.config.choice import PlugIn
@@ -31,11 +35,7 @@ from cloudrc.config.schema import (
     World,
 )
 from cloudrc.config.section import Section
-from cloudrc.messages import RAYS_MAX, SENSORS_MAX
-from cloudrc.outside.document import read_document
-from cloudrc.outside.refusal import check_names
-from cloudrc.outside.reuse import reuse
-from cloudrc.plugins import is_path
+from cloudrc.wire.messages import RAYS_MAX, SENSORS_MAX
 
 Braking = Annotated[float, Field(ge=0.1, le=10)]
 Hull = Annotated[float, Field(gt=0, le=10)]

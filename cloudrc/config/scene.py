@@ -6,13 +6,13 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
+from cloudrc.base.outside.refusal import naming
+from cloudrc.base.outside.reuse import reuse
 from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import World
-from cloudrc.geometry.fence import Fence
-from cloudrc.geometry.obstacles import fence_of
-from cloudrc.geometry.scene import Scene, load_scene
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.reuse import reuse
+from cloudrc.physics.geometry.fence import Fence
+from cloudrc.physics.geometry.obstacles import fence_of
+from cloudrc.physics.geometry.scene import Scene, load_scene
 
 
 def has_mujoco() -> bool:
@@ -34,7 +34,7 @@ def _read(world: World) -> Scene:
         scene = load_scene(world.scene, world.fence_m)
         if scene.path is None or not has_mujoco():
             return scene
-        from cloudrc.sim.bodies import complete
+        from cloudrc.physics.sim.bodies import complete
 
         return complete(scene)
 

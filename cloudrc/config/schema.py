@@ -2,8 +2,8 @@
 
 """Define every key of experiments and missions, with its unit, range and default.
 
-The name of a key ends with its unit (`delay_ms`); `cloudrc/assembly.py` and `cloudrc/link/` convert
-the values to SI units. Unknown keys are refused. The defaults are the control scheme and the gains
+The name of a key ends with its unit (`delay_ms`); `flight/assembly.py` and `link/` convert the
+values to SI units. Unknown keys are refused. The defaults are the control scheme and the gains
 of the paper. `Experiment` describes a file. `config.load.ResolvedExperiment` is the result of
 loading the file.
 """
@@ -23,6 +23,7 @@ from pydantic import (
     model_validator,
 )
 
+from cloudrc.base.outside.address import check_url
 from cloudrc.config.camera import CodecConfig
 from cloudrc.config.choice import NameOr
 from cloudrc.config.cloud import Cloud
@@ -32,12 +33,11 @@ from cloudrc.config.fleet import CellConfig, FleetConfig
 from cloudrc.config.follow import Follow
 from cloudrc.config.profile import CommandAge, DirectionConfig, StartConfig
 from cloudrc.config.section import Section, leave_out_unset
-from cloudrc.geometry.fence import Corners, order_of
 from cloudrc.link.profile import NotNegative as NotNegative
 from cloudrc.link.profile import Positive as Positive
 from cloudrc.link.profile import refuse_start
-from cloudrc.messages import TOUCH_NAME_MAX
-from cloudrc.outside.address import check_url
+from cloudrc.physics.geometry.fence import Corners, order_of
+from cloudrc.wire.messages import TOUCH_NAME_MAX
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Point = tuple[Finite, Finite, Finite]

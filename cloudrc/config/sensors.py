@@ -6,12 +6,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from cloudrc.base.outside.document import Document
 from cloudrc.config.camera import OF_CODEC
 from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import known_robot
 from cloudrc.config.schema import Experiment
-from cloudrc.outside.document import Document
 
 GIVE_SCANNER = "choose the rover, or give its robot.yaml the key scan"
 GIVE_CAMERA = "choose x2, or give its robot.yaml the key camera"

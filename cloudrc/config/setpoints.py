@@ -10,10 +10,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from cloudrc.errors import BadInputError
-from cloudrc.geometry.fence import Fence
-from cloudrc.messages import Vector
-from cloudrc.outside.tables import METRES, SECONDS, CsvTable
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.outside.tables import METRES, SECONDS, CsvTable
+from cloudrc.physics.geometry.fence import Fence
+from cloudrc.wire.messages import Vector
 
 COLUMNS = ["time_s", "x_m", "y_m", "z_m"]
 DRIVE_FILE = "drive.csv"

@@ -8,15 +8,16 @@ import os
 from functools import cache
 from pathlib import Path
 
-from cloudrc.errors import BadInputError
-from cloudrc.outside.document import Document, read_document
-from cloudrc.text import unknown_name_text
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.outside.document import Document, read_document
+from cloudrc.base.text import unknown_name_text
 
-_PACKAGE = Path(__file__).parents[1]
+_CONFIG = Path(__file__).parent
+_PACKAGE = _CONFIG.parent
 FOLDERS = {
-    "experiment": _PACKAGE / "experiments",
-    "mission": _PACKAGE / "missions",
-    "place": _PACKAGE / "places",
+    "experiment": _CONFIG / "experiments",
+    "mission": _CONFIG / "missions",
+    "place": _CONFIG / "places",
     "profile": _PACKAGE / "link" / "profiles",
     "scene": _PACKAGE / "world" / "scenes",
     "robot": _PACKAGE / "robots",

@@ -15,6 +15,8 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 
 from pydantic import Field, ValidatorFunctionWrapHandler, field_validator
 
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.outside.document import plain_document, read_document
 from cloudrc.config import problems, shipped
 from cloudrc.config.overrides import (
     Given,
@@ -26,8 +28,6 @@ from cloudrc.config.overrides import (
 from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.schema import Seed
 from cloudrc.config.section import Section
-from cloudrc.errors import BadInputError
-from cloudrc.outside.document import plain_document, read_document
 
 SEEDS_MAX = 10_000
 """Largest number of seeds."""

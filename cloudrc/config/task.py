@@ -13,9 +13,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
+from cloudrc.base.outside.document import read_document
 from cloudrc.config.problems import validate
 from cloudrc.config.section import Section
-from cloudrc.outside.document import read_document
 
 FormulaName = Literal[
     "mean", "hold time", "position", "orientation", "velocity, stamp", "P", "I", "D", "limit"

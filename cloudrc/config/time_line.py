@@ -4,9 +4,9 @@
 
 from __future__ import annotations
 
+from cloudrc.base.errors import CloudrcError
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.errors import CloudrcError
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.start import begin
 from cloudrc.link.traces import link_profile

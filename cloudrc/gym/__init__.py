@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Environments of gymnasium whose policy is at the other end of a link, in virtual time.
+"""A link between an environment of gymnasium and its policy: in virtual time.
 
 The import registers `cloudrc/Networked-v0`, `cloudrc/Steps-v0`, `cloudrc/Pipes-v0` and
 `cloudrc/Linear-v0`.
 """
 
-from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.base.errors import MissingPrerequisiteError
 
 try:
     import gymnasium as _gymnasium  # noqa: F401

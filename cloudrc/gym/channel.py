@@ -23,6 +23,8 @@ from typing import Any, cast
 import gymnasium
 from gymnasium.error import ResetNeeded
 
+from cloudrc.base.outside.refusal import naming
+from cloudrc.base.outside.values import InvalidValueError, Quantity, to_arrays
 from cloudrc.gym.lane import WaitingLane
 from cloudrc.gym.links import Links
 from cloudrc.gym.options import (
@@ -37,8 +39,6 @@ from cloudrc.gym.options import (
 from cloudrc.gym.schedules import Choose, Waiting, change_of, find_schedule
 from cloudrc.gym.step import find_step
 from cloudrc.gym.values import checker
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import InvalidValueError, Quantity, to_arrays
 
 SLOT = Quantity("ms", gt=0.0, le=3_600_000.0)
 """Time of a slot."""
@@ -195,7 +195,7 @@ class Channel:
             options: Options of `Networked`, also `dt`; a list has that of each robot.
 
         Raises:
-            cloudrc.errors.CloudrcError: If a value cannot be used; the text says what to change.
+            cloudrc.CloudrcError: If a value cannot be used; the text says what to change.
         """
         self.envs = [*envs]
         if not self.envs:

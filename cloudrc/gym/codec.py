@@ -17,15 +17,15 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from gymnasium import spaces
 
+from cloudrc.base.outside.values import to_arrays
 from cloudrc.cloud.perceptions import Frame
 from cloudrc.cloud.receiving import FrameReceiver
 from cloudrc.config.camera import CodecConfig
 from cloudrc.gym.executors import Committed
 from cloudrc.gym.lane import Wire
 from cloudrc.gym.values import copied, size_of
-from cloudrc.messages import FramePiece
-from cloudrc.outside.values import to_arrays
-from cloudrc.pictures import Encoded, make_decoder, make_encoder
+from cloudrc.wire.messages import FramePiece
+from cloudrc.wire.pictures import Encoded, make_decoder, make_encoder
 
 
 class Coded(NamedTuple):

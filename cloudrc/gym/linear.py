@@ -16,9 +16,9 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
+from cloudrc.base.outside.refusal import naming
+from cloudrc.base.outside.values import ANY, InvalidValueError, Quantity
 from cloudrc.link.draws import Floats
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import ANY, InvalidValueError, Quantity
 
 STEP = Quantity("s", gt=0.0, le=3600.0)
 """Time of a step."""
@@ -63,7 +63,7 @@ class Linear(gymnasium.Env[Floats, Floats]):
             limit: Size of a state at which an episode ends [1].
 
         Raises:
-            cloudrc.errors.BadInputError: If a value is no number, or two shapes do not fit.
+            cloudrc.BadInputError: If a value is no number, or two shapes do not fit.
         """
         states = next((len(ANY.array(each)) for each in (A, B) if np.ndim(each)), 1)
         self._a = _matrix("A", A, (states, states))

@@ -10,10 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cloudrc.base.outside.values import InvalidValueError
 from cloudrc.link.library import LinkProfile, read_profile
 from cloudrc.link.profile import RANDOM
 from cloudrc.link.start import draw
-from cloudrc.outside.values import InvalidValueError
 
 Profile = str | Path | Mapping[str, Any] | LinkProfile
 Links = Profile | Sequence[Profile] | Callable[[int], Profile]

@@ -35,6 +35,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from gymnasium.error import ResetNeeded
 
+from cloudrc.base.outside.values import Quantity
 from cloudrc.gym.ages import describe_ages
 from cloudrc.gym.answers import Answers, Instants
 from cloudrc.gym.asked import AskedOfWire, Met, expected
@@ -47,8 +48,7 @@ from cloudrc.gym.values import copied, size_of
 from cloudrc.link.draws import stream_key
 from cloudrc.link.library import LinkProfile
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.metrics.age import most_missed
-from cloudrc.outside.values import Quantity
+from cloudrc.results.metrics.age import most_missed
 
 if TYPE_CHECKING:
     from cloudrc.gym.codec import ObservationCodec

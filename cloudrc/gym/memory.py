@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
-from cloudrc.outside.values import Quantity, to_boolean
+from cloudrc.base.outside.values import Quantity, to_boolean
 
 ACTIONS = Quantity(ge=0, le=1000, whole=True)
 """Number of actions."""

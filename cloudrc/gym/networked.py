@@ -12,6 +12,8 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from cloudrc.base.outside.refusal import naming
+from cloudrc.base.outside.values import to_arrays
 from cloudrc.gym.links import Links
 from cloudrc.gym.options import (
     Options,
@@ -24,8 +26,6 @@ from cloudrc.gym.options import (
 )
 from cloudrc.gym.step import find_step
 from cloudrc.gym.values import checker
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import to_arrays
 
 
 class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -86,7 +86,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             acknowledge: "ideal": the policy learns which answers reached the robot; or None.
 
         Raises:
-            cloudrc.errors.CloudrcError: If a value cannot be used; the text says what to change.
+            cloudrc.CloudrcError: If a value cannot be used; the text says what to change.
         """
         options = read_options("Networked", options)
         RecordConstructorArgs.__init__(self, link=link, seed=seed, dt=dt, stream=stream, **options)

@@ -16,7 +16,9 @@ import gymnasium
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space, iterate
 
-from cloudrc import plugins
+from cloudrc.base import plugins
+from cloudrc.base.outside.refusal import check_names, naming
+from cloudrc.base.outside.values import InvalidValueError, Quantity
 from cloudrc.gym.doubts import LinkWarning
 from cloudrc.gym.executors import Executor
 from cloudrc.gym.lane import DATAGRAMS, DELIVERIES, Lane, WaitingLane
@@ -26,8 +28,6 @@ from cloudrc.gym.memory import Remembering
 from cloudrc.gym.step import FILM, WAY, StepTime, layers
 from cloudrc.gym.values import checker, copied, neutral, size_of
 from cloudrc.link.library import PACKET_BYTES, LinkProfile
-from cloudrc.outside.refusal import check_names, naming
-from cloudrc.outside.values import InvalidValueError, Quantity
 
 if TYPE_CHECKING:
     from cloudrc.config.camera import CodecConfig

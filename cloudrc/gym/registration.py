@@ -9,10 +9,10 @@ from typing import Any
 
 import gymnasium
 
+from cloudrc.base.outside.refusal import check_names
 from cloudrc.gym.networked import Networked
 from cloudrc.gym.options import ARGUMENTS
 from cloudrc.gym.vector import NetworkedVector
-from cloudrc.outside.refusal import check_names
 
 NAME = "cloudrc/Networked-v0"
 IDS: dict[str, dict[str, Any]] = {

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cloudrc.base.outside.refusal import check_names
+from cloudrc.base.outside.values import Quantity, to_arrays
+from cloudrc.base.plugins import Found, find, is_path
 from cloudrc.gym.values import leaves
 from cloudrc.link.draws import BLOCK, Purpose, stream_key, uniforms
-from cloudrc.outside.refusal import check_names
-from cloudrc.outside.values import Quantity, to_arrays
-from cloudrc.plugins import Found, find, is_path
 
 KIND = 135
 """Kind of the random numbers with which `random` chooses."""
@@ -142,7 +142,7 @@ def find_schedule(given: str | Path | Choose) -> Schedule:
     """Return a schedule by its name, from a file with `choose(waiting)`, or of such a function.
 
     Raises:
-        cloudrc.errors.CloudrcError: If there is none.
+        cloudrc.CloudrcError: If there is none.
     """
     if callable(given):
         return _Function(given)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import gymnasium
 from gymnasium.vector import AsyncVectorEnv, VectorWrapper
 
-from cloudrc.outside.values import ANY, InvalidValueError
+from cloudrc.base.outside.values import ANY, InvalidValueError
 
 CONTROL = ("step_dt", "control_hz", "control_freq", "policy_frequency")
 """Names that tell how often an environment takes an action, as in Isaac Lab, gym-pusht, robosuite,

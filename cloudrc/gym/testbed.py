@@ -18,25 +18,25 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from cloudrc.assembly import assemble, build_links, flight_limit
+from cloudrc.base.outside.refusal import naming
+from cloudrc.base.outside.values import RESULT
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config.problems import problem_at
 from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Link
-from cloudrc.drivers.virtual import VirtualRun
-from cloudrc.messages import Datagram, Odometry, Setpoint
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import RESULT
-from cloudrc.record.columns import Recording, RecordStore
-from cloudrc.report.document import Run
-from cloudrc.report.write import assess
-from cloudrc.runs.experiment import load
-from cloudrc.runs.requirements import SIM, require
+from cloudrc.flight.assembly import assemble, build_links, flight_limit
+from cloudrc.flight.drivers.virtual import VirtualRun
+from cloudrc.flight.runs.experiment import load
+from cloudrc.flight.runs.requirements import SIM, require
+from cloudrc.results.record.columns import Recording, RecordStore
+from cloudrc.results.report.document import Run
+from cloudrc.results.report.write import assess
+from cloudrc.wire.messages import Datagram, Odometry, Setpoint
 
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
-    from cloudrc.endpoint import Endpoint
+    from cloudrc.wire.endpoint import Endpoint
 
 NEVER_NS = 1 << 62
 """Time of the cloud's next period while it waits for the policy [ns]."""

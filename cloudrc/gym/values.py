@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import RESULT, InvalidValueError, shorten, to_arrays
+from cloudrc.base.outside.refusal import naming
+from cloudrc.base.outside.values import RESULT, InvalidValueError, shorten, to_arrays
 
 _UNCHANGING = {bool, int, float, str, np.int64, np.float32, np.float64}
 """Types of values that are their own copies."""

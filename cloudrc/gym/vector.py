@@ -11,6 +11,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
+from cloudrc.base.outside.refusal import naming
+from cloudrc.base.outside.values import to_arrays
 from cloudrc.gym.links import Links
 from cloudrc.gym.options import (
     Options,
@@ -23,8 +25,6 @@ from cloudrc.gym.options import (
 )
 from cloudrc.gym.step import find_step
 from cloudrc.gym.values import checker
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import to_arrays
 
 if TYPE_CHECKING:
     _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Emulate the network between world and cloud: netem or a relay acts as a profile says.
+"""The network between world and cloud: netem or a relay acts as a profile says.
 
 For programs, the package is a library: `cloudrc.link.open` gives the model of both directions.
 """

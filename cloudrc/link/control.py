@@ -10,7 +10,7 @@ JSON object, file name -> text: `follow.PROFILE`, the traces that the profile na
 
 from __future__ import annotations
 
-from cloudrc.errors import RejectedError
+from cloudrc.base.errors import RejectedError
 from cloudrc.link.state import LinkState, from_text
 
 SOCKET = "link.sock"

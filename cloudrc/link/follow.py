@@ -19,13 +19,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from cloudrc.errors import CloudrcError
-from cloudrc.files import version
+from cloudrc.base.errors import CloudrcError
+from cloudrc.base.files import version
+from cloudrc.base.outside.document import write_yaml
 from cloudrc.link.profile import DIRECTIONS, summary
 from cloudrc.link.profile_file import FILE_KEYS, with_files
 from cloudrc.link.start import begin, describe
 from cloudrc.link.state import CHANGE_FILE, ChangeFacts, LinkState, publish, read_change, to_text
-from cloudrc.outside.document import write_yaml
 
 if TYPE_CHECKING:
     from cloudrc.link.carry.udp import Address

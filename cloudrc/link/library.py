@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from cloudrc.base.outside.refusal import naming
+from cloudrc.base.outside.values import Quantity
 from cloudrc.link.draws import (
     BLOCK,
     Fate,
@@ -34,8 +36,6 @@ from cloudrc.link.profile import (
     Start,
     going_round,
 )
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import Quantity
 
 if TYPE_CHECKING:
     from cloudrc.link.streams import Numbers

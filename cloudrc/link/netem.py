@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.errors import CloudrcError, MissingPrerequisiteError, RejectedError
+from cloudrc.base.errors import CloudrcError, MissingPrerequisiteError, RejectedError
 from cloudrc.link.carry.udp import Address
 from cloudrc.link.draws import PARETO_CUT, Floats
 from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline

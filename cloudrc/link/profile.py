@@ -17,7 +17,7 @@ from itertools import pairwise
 from math import inf
 from typing import Annotated, Final, Literal, NamedTuple
 
-from cloudrc.outside.values import Quantity
+from cloudrc.base.outside.values import Quantity
 
 NotNegative = Annotated[float, Quantity(ge=0)]
 Positive = Annotated[float, Quantity(gt=0)]

@@ -16,11 +16,11 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from cloudrc.errors import BadInputError
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.outside.document import Document, KeyPath, plain_document, read_document
+from cloudrc.base.outside.values import InvalidValueError
+from cloudrc.base.text import unknown_name_text
 from cloudrc.link.profile import DIRECTIONS, DirectionKeys, DirectionProfile, ProfileKeys
-from cloudrc.outside.document import Document, KeyPath, plain_document, read_document
-from cloudrc.outside.values import InvalidValueError
-from cloudrc.text import unknown_name_text
 
 FOLDER = Path(__file__).with_name("profiles")
 FILE_KEYS = ("trace", "table", "rate_trace")

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from cloudrc.errors import CloudrcError
-from cloudrc.files import write_atomically
+from cloudrc.base.errors import CloudrcError
+from cloudrc.base.files import write_atomically
 from cloudrc.link.carry.udp import Address, Relay
 from cloudrc.link.follow import Loaded, publish_state
 from cloudrc.link.profile import DirectionProfile

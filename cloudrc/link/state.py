@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cloudrc.files import write_atomically
+from cloudrc.base.files import write_atomically
 
 STATE_FILE = "link.json"  # name of the state file, in the folder of the route file
 STATE_MAX = 1 << 16

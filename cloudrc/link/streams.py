@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cloudrc.base.rounding import differences
 from cloudrc.link.model import LinkDirection
-from cloudrc.rounding import differences
 
 Array = NDArray[Any]
 

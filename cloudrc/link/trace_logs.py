@@ -24,10 +24,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from cloudrc.base.outside.tables import SECONDS, CsvTable
+from cloudrc.base.outside.values import InvalidValueError, Quantity
 from cloudrc.link.profile import Trace
 from cloudrc.link.streams import Stream
-from cloudrc.outside.tables import SECONDS, CsvTable
-from cloudrc.outside.values import InvalidValueError, Quantity
 
 Direction = Literal["uplink", "downlink"]
 Entry = tuple[float, float, bool]

@@ -16,8 +16,13 @@ from math import fsum, sqrt
 from pathlib import Path
 from typing import Any
 
-from cloudrc.errors import BadInputError
-from cloudrc.files import version
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.files import version
+from cloudrc.base.outside.paths import read_file
+from cloudrc.base.outside.refusal import naming
+from cloudrc.base.outside.tables import SECONDS, SHARE, SIZE_MAX, CsvTable, read_lines
+from cloudrc.base.outside.values import InvalidValueError, Quantity
+from cloudrc.base.rounding import differences
 from cloudrc.link.profile import (
     Blackout,
     Change,
@@ -28,11 +33,6 @@ from cloudrc.link.profile import (
     Trace,
     refuse_period,
 )
-from cloudrc.outside.paths import read_file
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.tables import SECONDS, SHARE, SIZE_MAX, CsvTable, read_lines
-from cloudrc.outside.values import InvalidValueError, Quantity
-from cloudrc.rounding import differences
 
 START_MAX = 600.0  # if the first row is later, times count from the first row [s]
 EXAMPLE = "time_s,delay_ms,loss"

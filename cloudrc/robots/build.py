@@ -9,7 +9,11 @@ from copy import copy
 from pathlib import Path
 from typing import Any
 
-from cloudrc import plugins
+from cloudrc.base import plugins
+from cloudrc.base.outside.document import KeyPath
+from cloudrc.base.outside.refusal import naming
+from cloudrc.base.outside.reuse import reuse
+from cloudrc.base.outside.values import RESULT
 from cloudrc.config.choice import PlugIn
 from cloudrc.config.disturbances import Plant
 from cloudrc.config.overrides import BRAKING, build_plugin, onboard_values
@@ -19,23 +23,19 @@ from cloudrc.config.robot import RobotFiles, known_robot, parameters
 from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import ROBOT_FILE, file_of
-from cloudrc.messages import ZERO, Vector
-from cloudrc.outside.document import KeyPath
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.reuse import reuse
-from cloudrc.outside.values import RESULT
-from cloudrc.sim.airframe import thrust_to_weight
-from cloudrc.sim.energy import EnergyMeter, power_factors
-from cloudrc.sim.onboard import Accelerator, Actuators, Direct, Onboard
-from cloudrc.sim.plant import Wind
-from cloudrc.sim.scene import (
+from cloudrc.physics.sim.airframe import thrust_to_weight
+from cloudrc.physics.sim.energy import EnergyMeter, power_factors
+from cloudrc.physics.sim.onboard import Accelerator, Actuators, Direct, Onboard
+from cloudrc.physics.sim.plant import Wind
+from cloudrc.physics.sim.scene import (
     compile_model,
     compile_true,
     find_camera,
     find_part,
     find_sensors,
 )
-from cloudrc.sim.simulator import Simulator, rest_height
+from cloudrc.physics.sim.simulator import Simulator, rest_height
+from cloudrc.wire.messages import ZERO, Vector
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.robot import STEP, Robot
 

@@ -15,20 +15,20 @@ from typing import Any
 
 import numpy as np
 
+from cloudrc.base.outside.code import calling
+from cloudrc.base.text import table
 from cloudrc.config.hull import doubts, hull_of
 from cloudrc.config.overrides import onboard_values
 from cloudrc.config.problems import ConfigProblem, collect
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, find_robot
 from cloudrc.config.schema import World
-from cloudrc.geometry.vectors import step_towards
-from cloudrc.messages import ZERO, Vector
-from cloudrc.outside.code import calling
+from cloudrc.physics.geometry.vectors import step_towards
+from cloudrc.physics.sim.airframe import read_turns, thrust_to_weight
+from cloudrc.physics.sim.bodies import reach_of
+from cloudrc.physics.sim.scene import ROBOT_PREFIX
 from cloudrc.robots.build import advise, build_robot, check_robot
-from cloudrc.sim.airframe import read_turns, thrust_to_weight
-from cloudrc.sim.bodies import reach_of
-from cloudrc.sim.scene import ROBOT_PREFIX
-from cloudrc.text import table
+from cloudrc.wire.messages import ZERO, Vector
 from cloudrc.world.guard.limits import REACTION
 from cloudrc.world.robot import STEP, Robot
 

@@ -1,3 +1,3 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Studies with trials: sweep, compare, margin, identify."""
+"""Questions that many flights or episodes answer: sweep, compare, margin, eval, rank, exercise."""

@@ -17,20 +17,20 @@ from operator import itemgetter
 from statistics import fmean, median_low
 from typing import Any
 
+from cloudrc.base.errors import NothingFlownError
+from cloudrc.base.statistics import exact_interval, median_interval
 from cloudrc.config.compute import compute_times
 from cloudrc.config.problems import problem_at
-from cloudrc.errors import NothingFlownError
+from cloudrc.flight.runs.experiment import load, robots_of
+from cloudrc.flight.runs.flight import ERROR
+from cloudrc.flight.trials.fingerprint import experiment_facts, fingerprint
+from cloudrc.flight.trials.fleet import alone, plan_fleet
+from cloudrc.flight.trials.plan import PlannedFlight
+from cloudrc.flight.trials.play import run
+from cloudrc.flight.trials.rows import Row, Rows
 from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.profile import DIRECTIONS
 from cloudrc.link.waiting import nddd1
-from cloudrc.runs.experiment import load, robots_of
-from cloudrc.runs.flight import ERROR
-from cloudrc.statistics import exact_interval, median_interval
-from cloudrc.trials.fingerprint import experiment_facts, fingerprint
-from cloudrc.trials.fleet import alone, plan_fleet
-from cloudrc.trials.plan import PlannedFlight
-from cloudrc.trials.play import run
-from cloudrc.trials.rows import Row, Rows
 
 SLACK = 1.4
 """Time limit of a mission, as a multiple of its duration alone [1]: a robot in HOLD would fly on

@@ -9,10 +9,10 @@ from functools import partial
 from math import nan
 from typing import Any
 
-from cloudrc.report.figures.bands import Panel, Point, draw
-from cloudrc.report.figures.style import Look
-from cloudrc.text import cells, table
-from cloudrc.trials.rows import Row
+from cloudrc.base.text import cells, table
+from cloudrc.flight.trials.rows import Row
+from cloudrc.results.report.figures.bands import Panel, Point, draw
+from cloudrc.results.report.figures.style import Look
 
 COLUMNS = {
     "queue": "{queue}",

@@ -9,19 +9,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cloudrc.base.errors import CloudrcError, NothingFlownError
+from cloudrc.base.outside.refusal import check_names, naming
+from cloudrc.base.outside.values import InvalidValueError
 from cloudrc.config.problems import problem_at
 from cloudrc.config.sweep import draft_of
-from cloudrc.errors import CloudrcError, NothingFlownError
-from cloudrc.metrics.budget import NAMES, NUMBER
-from cloudrc.metrics.measure import SHIPPED
-from cloudrc.outside.refusal import check_names, naming
-from cloudrc.outside.values import InvalidValueError
-from cloudrc.runs.flight import counts
-from cloudrc.studies.sweep import read_flights
-from cloudrc.trials.plan import SweepPlan, check
-from cloudrc.trials.play import run
-from cloudrc.trials.rows import Row, Rows
-from cloudrc.trials.summary import (
+from cloudrc.flight.runs.flight import counts
+from cloudrc.flight.trials.plan import SweepPlan, check
+from cloudrc.flight.trials.play import run
+from cloudrc.flight.trials.rows import Row, Rows
+from cloudrc.flight.trials.summary import (
     NO_RATIO,
     OFF_PATH,
     RATIO,
@@ -34,6 +31,9 @@ from cloudrc.trials.summary import (
     pair,
     values_of,
 )
+from cloudrc.results.metrics.budget import NAMES, NUMBER
+from cloudrc.results.metrics.measure import SHIPPED
+from cloudrc.studies.sweep import read_flights
 
 METHOD = (
     "B - A: Hodges-Lehmann estimate, 95 % interval and p of the exact Wilcoxon signed-rank test, "

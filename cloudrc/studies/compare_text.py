@@ -7,11 +7,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from cloudrc.metrics.measure import scale
-from cloudrc.statistics import LEVEL, by_chance
+from cloudrc.base.statistics import LEVEL, by_chance
+from cloudrc.base.text import FAILED_MARK, FAILED_NOTE, format_number, table
+from cloudrc.flight.trials.summary import NO_RATIO, OFF_PATH
+from cloudrc.results.metrics.measure import scale
 from cloudrc.studies.compare import LEFT_OUT
-from cloudrc.text import FAILED_MARK, FAILED_NOTE, format_number, table
-from cloudrc.trials.summary import NO_RATIO, OFF_PATH
 
 TITLES = (
     "number",

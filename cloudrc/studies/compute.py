@@ -10,16 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cloudrc import assembly
+from cloudrc.base.errors import NothingFlownError
+from cloudrc.base.outside.code import apart
 from cloudrc.cloud.compute_time import ComputeTime
-from cloudrc.drivers.cpu_limit import PacedClock, cpu_limit
-from cloudrc.errors import NothingFlownError
-from cloudrc.messages import plan_length
-from cloudrc.outside.code import apart
-from cloudrc.report.folder import read_run
-from cloudrc.runs.experiment import load
-from cloudrc.runs.interrupts import raise_if_interrupted
-from cloudrc.tunnel.codec import COMMAND_SIZES, Kind
+from cloudrc.flight import assembly
+from cloudrc.flight.drivers.cpu_limit import PacedClock, cpu_limit
+from cloudrc.flight.runs.experiment import load
+from cloudrc.flight.runs.interrupts import raise_if_interrupted
+from cloudrc.results.report.folder import read_run
+from cloudrc.wire.messages import plan_length
+from cloudrc.wire.tunnel.codec import COMMAND_SIZES, Kind
 
 ARRIVAL = "epoch", "counter", "delay"
 """Columns of the topic /downlink_delay."""

@@ -9,14 +9,14 @@ from math import nan, sqrt
 from statistics import median
 from typing import Any
 
-from cloudrc.metrics.measure import SHIPPED, scale
-from cloudrc.outside.refusal import check_names
-from cloudrc.report.figures.bands import Panel, Point, draw
-from cloudrc.report.figures.style import Look
-from cloudrc.runs.flight import counts
-from cloudrc.statistics import exact_interval, median_interval
-from cloudrc.trials.rows import Row
-from cloudrc.trials.summary import RATIO, count_successes, default_numbers, values_of
+from cloudrc.base.outside.refusal import check_names
+from cloudrc.base.statistics import exact_interval, median_interval
+from cloudrc.flight.runs.flight import counts
+from cloudrc.flight.trials.rows import Row
+from cloudrc.flight.trials.summary import RATIO, count_successes, default_numbers, values_of
+from cloudrc.results.metrics.measure import SHIPPED, scale
+from cloudrc.results.report.figures.bands import Panel, Point, draw
+from cloudrc.results.report.figures.style import Look
 
 COLUMN = Look(width=3.5)
 """Look of a figure in one column of a page. Source: IEEE conference template."""

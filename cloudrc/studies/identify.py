@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from cloudrc.base.outside.refusal import naming
+from cloudrc.base.text import table
 from cloudrc.config.load import read_experiment
-from cloudrc.metrics import velocity_loop
-from cloudrc.metrics.velocity_loop import DT, INPUT, OUTPUT, Fit
-from cloudrc.outside.refusal import naming
-from cloudrc.record.columns import Recording
-from cloudrc.report.flown import flown_world
-from cloudrc.report.folder import open_recording
-from cloudrc.text import table
+from cloudrc.results.metrics import velocity_loop
+from cloudrc.results.metrics.velocity_loop import DT, INPUT, OUTPUT, Fit
+from cloudrc.results.record.columns import Recording
+from cloudrc.results.report.flown import flown_world
+from cloudrc.results.report.folder import open_recording
 
 NAMES = ("time_constant", "dead_time", "gain")
 

@@ -10,19 +10,19 @@ from contextlib import closing
 from functools import cache
 from typing import Any, NamedTuple
 
-from cloudrc.ages import simulate_ages
+from cloudrc.base.errors import CloudrcError
+from cloudrc.base.outside.document import child
 from cloudrc.config.overrides import onboard_values
 from cloudrc.config.problems import problem_at
 from cloudrc.config.profile import COMMAND_AGE_MS
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.errors import CloudrcError
-from cloudrc.outside.document import child
-from cloudrc.runs import flight
-from cloudrc.runs.experiment import check_no_seed, load
+from cloudrc.flight.ages import simulate_ages
+from cloudrc.flight.runs import flight
+from cloudrc.flight.runs.experiment import check_no_seed, load
+from cloudrc.flight.trials.workers import map_in_order
 from cloudrc.studies import stability
 from cloudrc.studies.search import ValueRange, bisect, search
 from cloudrc.studies.stability import LARGE
-from cloudrc.trials.workers import map_in_order
 
 QUESTIONS = {
     "stable": "is the loop stable? a step of {small:g} m per axis in the scene {scene}",

@@ -16,13 +16,13 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
+from cloudrc.base.outside.reuse import reuse_results
+from cloudrc.base.statistics import LEVEL, PAIRS_MIN, sign_test
+from cloudrc.base.text import cells, escape, table
 from cloudrc.config.overrides import parse_settings
-from cloudrc.outside.reuse import reuse_results
-from cloudrc.statistics import LEVEL, PAIRS_MIN, sign_test
-from cloudrc.text import cells, escape, table
-from cloudrc.trials.fleet import plan_fleet
-from cloudrc.trials.plan import PlannedFlight
-from cloudrc.trials.rows import Row
+from cloudrc.flight.trials.fleet import plan_fleet
+from cloudrc.flight.trials.plan import PlannedFlight
+from cloudrc.flight.trials.rows import Row
 
 DISTURBANCES = {
     "world.wind.velocity_mps": "[1, 0]",

@@ -10,8 +10,8 @@ from collections.abc import Callable, Generator, Sequence
 from cloudrc.cluster import batch
 from cloudrc.cluster.batch import PodSettings
 from cloudrc.cluster.client import ClusterError, Release
-from cloudrc.trials.plan import PlannedFlight, SweepPlan, pack
-from cloudrc.trials.rows import Row, parse_row
+from cloudrc.flight.trials.plan import PlannedFlight, SweepPlan, pack
+from cloudrc.flight.trials.rows import Row, parse_row
 
 
 def fly_in_pods(

@@ -19,20 +19,28 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc import assembly
-from cloudrc.ages import simulate_ages
+from cloudrc.base.outside import code
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
-from cloudrc.geometry.scene import load_scene
-from cloudrc.messages import GuardState
-from cloudrc.metrics.counters import growth
-from cloudrc.metrics.verdict import NOT_STARTED, plugin_failures
-from cloudrc.outside import code
-from cloudrc.record.columns import Recording, RecordStore
-from cloudrc.record.holes import END_NS
-from cloudrc.records import Control, Counted, Fault, GroundTruth, GuardChange, MissionEvent, Record
-from cloudrc.runs.flight import explain
+from cloudrc.flight import assembly
+from cloudrc.flight.ages import simulate_ages
+from cloudrc.flight.runs.flight import explain
+from cloudrc.physics.geometry.scene import load_scene
+from cloudrc.results.metrics.counters import growth
+from cloudrc.results.metrics.verdict import NOT_STARTED, plugin_failures
+from cloudrc.results.record.columns import Recording, RecordStore
+from cloudrc.results.record.holes import END_NS
+from cloudrc.wire.messages import GuardState
+from cloudrc.wire.records import (
+    Control,
+    Counted,
+    Fault,
+    GroundTruth,
+    GuardChange,
+    MissionEvent,
+    Record,
+)
 
 Array = NDArray[np.float64]
 SCENE = "empty"

@@ -17,26 +17,26 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cloudrc import source
-from cloudrc.errors import (
+from cloudrc.base import source
+from cloudrc.base.errors import (
     CloudrcError,
     InvalidRunError,
     NothingFlownError,
     StateError,
     to_one_line,
 )
-from cloudrc.files import read_json, write_atomically, write_json
-from cloudrc.outside.document import read_document, write_yaml
-from cloudrc.outside.paths import LOCK, lock_folder
-from cloudrc.runs.fly import fly
-from cloudrc.runs.folder import new_folder
-from cloudrc.text import table
-from cloudrc.trials import tables
-from cloudrc.trials.plan import COLUMNS, PlannedFlight, SweepPlan, read_plan
-from cloudrc.trials.rows import SIZE_MAX, Row, Rows, read_rows
-from cloudrc.trials.summary import added, count_successes, count_verdicts, normalise
-from cloudrc.trials.tables import Columns, as_text, write_table
-from cloudrc.trials.workers import map_in_order, take_each
+from cloudrc.base.files import read_json, write_atomically, write_json
+from cloudrc.base.outside.document import read_document, write_yaml
+from cloudrc.base.outside.paths import LOCK, lock_folder
+from cloudrc.base.text import table
+from cloudrc.flight.runs.fly import fly
+from cloudrc.flight.runs.folder import new_folder
+from cloudrc.flight.trials import tables
+from cloudrc.flight.trials.plan import COLUMNS, PlannedFlight, SweepPlan, read_plan
+from cloudrc.flight.trials.rows import SIZE_MAX, Row, Rows, read_rows
+from cloudrc.flight.trials.summary import added, count_successes, count_verdicts, normalise
+from cloudrc.flight.trials.tables import Columns, as_text, write_table
+from cloudrc.flight.trials.workers import map_in_order, take_each
 from cloudrc.version import __version__
 
 FILE, SUMMARY, PODS = "sweep.yaml", "sweep.json", "pods.json"

@@ -1,3 +1,3 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Teleop: turn the operator's commands into missions, setpoints and requests to the robot."""
+"""Missions and their API: what an operator asks becomes setpoints and requests to the robot."""

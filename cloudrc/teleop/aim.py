@@ -9,11 +9,11 @@ from collections.abc import Callable
 from math import dist
 from operator import add
 
-from cloudrc.geometry.fence import Fence
-from cloudrc.geometry.vectors import turn_to
-from cloudrc.messages import NEVER_NS, Drive, Motion, Setpoint, Vector
+from cloudrc.physics.geometry.fence import Fence
+from cloudrc.physics.geometry.vectors import turn_to
 from cloudrc.teleop.carrot import ACCELERATION, arrival_ns, setpoint_at, steer
 from cloudrc.teleop.wire import Leg, Plan, RobotStatus
+from cloudrc.wire.messages import NEVER_NS, Drive, Motion, Setpoint, Vector
 
 NO_WAYPOINT = -1
 """Waypoint index in a setpoint or event that belongs to no waypoint."""

@@ -23,9 +23,9 @@ from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
+from cloudrc.base.errors import CloudrcError
+from cloudrc.base.files import at_place
 from cloudrc.config.section import Section
-from cloudrc.errors import CloudrcError
-from cloudrc.files import at_place
 from cloudrc.teleop import models
 from cloudrc.teleop.auth import BEARER, REFUSED, Gate
 from cloudrc.teleop.refusals import ConflictError, UnavailableError

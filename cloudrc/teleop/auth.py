@@ -20,9 +20,9 @@ from fastapi.security import HTTPBearer
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from cloudrc.errors import CloudrcError, to_one_line
-from cloudrc.files import warn_if_readable
-from cloudrc.outside.paths import read_tokens
+from cloudrc.base.errors import CloudrcError, to_one_line
+from cloudrc.base.files import warn_if_readable
+from cloudrc.base.outside.paths import read_tokens
 
 OPERATOR, READER = "operator", "reader"
 """Roles of callers; the token of a role is in a file with the name of the role."""

@@ -16,8 +16,8 @@ from collections.abc import Callable
 from functools import partial
 from math import cos, dist, sin, sqrt
 
-from cloudrc.geometry.fence import Fence
-from cloudrc.messages import ZERO, Drive, Motion, Setpoint, Vector
+from cloudrc.physics.geometry.fence import Fence
+from cloudrc.wire.messages import ZERO, Drive, Motion, Setpoint, Vector
 
 HEARTBEAT_NS = 500_000_000
 """Time from the last request to drive until the setpoint begins to brake [ns]."""

@@ -16,10 +16,10 @@ from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
 
-from cloudrc.errors import CloudrcError, RejectedError
-from cloudrc.outside.paths import TOKEN_VARIABLE
-from cloudrc.outside.values import InvalidValueError
-from cloudrc.text import escape
+from cloudrc.base.errors import CloudrcError, RejectedError
+from cloudrc.base.outside.paths import TOKEN_VARIABLE
+from cloudrc.base.outside.values import InvalidValueError
+from cloudrc.base.text import escape
 
 if TYPE_CHECKING:
     from cloudrc.teleop.wire import RobotStatus

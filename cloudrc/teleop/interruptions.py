@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from cloudrc.messages import GuardState
-from cloudrc.metrics.verdict import FailureCode, FlightFailure
+from cloudrc.base.text import describe_point
+from cloudrc.results.metrics.verdict import FailureCode, FlightFailure
 from cloudrc.teleop.wire import EventName, RobotStatus
-from cloudrc.text import describe_point
+from cloudrc.wire.messages import GuardState
 
 SILENCE = 1.0
 """Age above which telemetry, or the last message from cloud, is too old [s]."""

@@ -25,20 +25,9 @@ from collections.abc import Callable
 from math import dist
 from typing import TYPE_CHECKING, Literal
 
-from cloudrc.geometry.fence import Fence
-from cloudrc.messages import (
-    MISSION_OVER,
-    NEVER_NS,
-    ZERO,
-    Cause,
-    GuardState,
-    Motion,
-    Request,
-    Start,
-    Vector,
-)
-from cloudrc.metrics.verdict import Ending
-from cloudrc.records import MissionEnd, MissionEvent, MissionFailure, MissionState, UnderWay
+from cloudrc.base.text import describe_point
+from cloudrc.physics.geometry.fence import Fence
+from cloudrc.results.metrics.verdict import Ending
 from cloudrc.teleop.aim import NO_WAYPOINT, Aim
 from cloudrc.teleop.carrot import HEARTBEAT_NS
 from cloudrc.teleop.refusals import ConflictError
@@ -54,7 +43,18 @@ from cloudrc.teleop.wire import (
     Output,
     RobotStatus,
 )
-from cloudrc.text import describe_point
+from cloudrc.wire.messages import (
+    MISSION_OVER,
+    NEVER_NS,
+    ZERO,
+    Cause,
+    GuardState,
+    Motion,
+    Request,
+    Start,
+    Vector,
+)
+from cloudrc.wire.records import MissionEnd, MissionEvent, MissionFailure, MissionState, UnderWay
 
 if TYPE_CHECKING:
     from cloudrc.teleop.store import MissionRecord

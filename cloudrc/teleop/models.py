@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import ConfigDict, Field, ValidationError
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.follow import Follow
 from cloudrc.config.ground import put_on_ground
 from cloudrc.config.heading import WHY, without_held_yaws
@@ -35,12 +36,11 @@ from cloudrc.config.schema import (
     Yaw,
 )
 from cloudrc.config.section import Described, Section
-from cloudrc.errors import BadInputError
-from cloudrc.messages import Vector
-from cloudrc.metrics.verdict import FailureCode, Outcome
-from cloudrc.records import MissionEnd, MissionState
+from cloudrc.results.metrics.verdict import FailureCode, Outcome
 from cloudrc.teleop.store import SHOWN, Order
 from cloudrc.teleop.wire import EventName, Leg, Plan
+from cloudrc.wire.messages import Vector
+from cloudrc.wire.records import MissionEnd, MissionState
 
 PROBLEMS_MAX = 50
 """Largest number of problems that one answer lists."""

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from cloudrc.errors import CloudrcError
+from cloudrc.base.errors import CloudrcError
 
 
 class UnknownMissionError(CloudrcError):

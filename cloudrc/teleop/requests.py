@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from cloudrc.messages import GuardState, OperatorRequest, Request, Start
 from cloudrc.teleop.wire import RobotStatus
+from cloudrc.wire.messages import GuardState, OperatorRequest, Request, Start
 
 # To look up a member takes time.
 GROUND, HOLD, ESTOP = GuardState.GROUND, GuardState.HOLD, GuardState.ESTOP

@@ -4,9 +4,9 @@
 
 from __future__ import annotations
 
-from cloudrc.messages import NEVER_NS, GuardState, Vector
 from cloudrc.teleop.aim import Aim
 from cloudrc.teleop.wire import Leg, Plan, RobotStatus
+from cloudrc.wire.messages import NEVER_NS, GuardState, Vector
 
 GAP_MAX_NS = 500_000_000
 """Longest gap in telemetry that counts in full as time of flight [ns]. Of a longer gap only this

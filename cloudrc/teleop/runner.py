@@ -12,18 +12,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from cloudrc.geometry.fence import Fence
-from cloudrc.messages import GuardState, Setpoint
-from cloudrc.metrics.flight import finite
-from cloudrc.metrics.verdict import Observations, judge
-from cloudrc.records import Fault, MissionEvent
+from cloudrc.base.text import describe_point
+from cloudrc.physics.geometry.fence import Fence
+from cloudrc.results.metrics.flight import finite
+from cloudrc.results.metrics.verdict import Observations, judge
 from cloudrc.teleop.interruptions import SILENCE, Interruptions
 from cloudrc.teleop.mission import MissionFlight, Teleop
 from cloudrc.teleop.refusals import ConflictError
 from cloudrc.teleop.store import MissionRecord, MissionStore
 from cloudrc.teleop.view import RobotView
 from cloudrc.teleop.wire import FLYING, HELD, QUEUED, EventName, Output, RobotStatus
-from cloudrc.text import describe_point
+from cloudrc.wire.messages import GuardState, Setpoint
+from cloudrc.wire.records import Fault, MissionEvent
 
 _, TRACK, HOLD, LAND, ESTOP = GuardState
 LATCHED, AIRBORNE = (LAND, ESTOP), (TRACK, HOLD, LAND)

@@ -11,20 +11,20 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.geometry.clearance import NO_SIZE, Spheres
-from cloudrc.geometry.fence import Fence
-from cloudrc.geometry.obstacles import obstacles, surface
-from cloudrc.geometry.placement import find_crossed
-from cloudrc.geometry.scene import Scene
-from cloudrc.messages import Start, Vector
-from cloudrc.metrics.verdict import FlightFailure, FlightVerdict
+from cloudrc.base.text import describe_point
+from cloudrc.physics.geometry.clearance import NO_SIZE, Spheres
+from cloudrc.physics.geometry.fence import Fence
+from cloudrc.physics.geometry.obstacles import obstacles, surface
+from cloudrc.physics.geometry.placement import find_crossed
+from cloudrc.physics.geometry.scene import Scene
+from cloudrc.results.metrics.verdict import FlightFailure, FlightVerdict
 from cloudrc.teleop.carrot import HEARTBEAT_NS, SPEED_MAX, TURN_MAX
 from cloudrc.teleop.refusals import ConflictError, UnavailableError
 from cloudrc.teleop.runner import STOP_IS_SENT, MissionRunner
 from cloudrc.teleop.store import MissionRecord, MissionStore, Order
 from cloudrc.teleop.view import DRIVEN
 from cloudrc.teleop.wire import HELD, Leg, Plan
-from cloudrc.text import describe_point
+from cloudrc.wire.messages import Start, Vector
 
 DRIVE_LIMIT = 3600.0
 """Time limit of a mission that begins with a request to drive [s]."""

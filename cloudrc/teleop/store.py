@@ -20,12 +20,12 @@ from typing import Any, TypeAlias
 
 from pydantic import TypeAdapter
 
+from cloudrc.base.errors import CloudrcError, StateError
 from cloudrc.config.schema import Touch
-from cloudrc.errors import CloudrcError, StateError
-from cloudrc.metrics.verdict import Observations
-from cloudrc.records import MissionState
+from cloudrc.results.metrics.verdict import Observations
 from cloudrc.teleop.refusals import UnavailableError, UnknownMissionError
 from cloudrc.teleop.wire import ENDED, QUEUED, STATES, EventName, Plan
+from cloudrc.wire.records import MissionState
 
 Event: TypeAlias = dict[str, Any]
 """An event of a mission, in the form of the API's model `Event`."""

@@ -7,8 +7,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from cloudrc.base.text import describe_point, describe_sensors, table
 from cloudrc.teleop.client import describe_verdict
-from cloudrc.text import describe_point, describe_sensors, table
 
 
 def missions_table(missions: Sequence[Mapping[str, Any]]) -> str:

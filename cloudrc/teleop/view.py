@@ -7,10 +7,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from cloudrc.messages import GuardState
-from cloudrc.metrics.flight import finite
+from cloudrc.results.metrics.flight import finite
 from cloudrc.teleop.interruptions import SILENCE
 from cloudrc.teleop.wire import HELD, RobotStatus
+from cloudrc.wire.messages import GuardState
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 DRIVEN = "driven"

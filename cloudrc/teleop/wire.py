@@ -15,10 +15,11 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 from pydantic import TypeAdapter
 from pydantic_core import to_json
 
+from cloudrc.base.rounding import exceeds
 from cloudrc.config.follow import Follow
 from cloudrc.config.schema import YAW_TOLERANCE_DEG, JudgedBy
-from cloudrc.geometry.vectors import turn_to
-from cloudrc.messages import (
+from cloudrc.physics.geometry.vectors import turn_to
+from cloudrc.wire.messages import (
     NEVER_NS,
     UPRIGHT,
     ZERO,
@@ -31,8 +32,7 @@ from cloudrc.messages import (
     Start,
     Vector,
 )
-from cloudrc.records import FAILURES, Control, MissionEnd, MissionEvent, MissionState, UnderWay
-from cloudrc.rounding import exceeds
+from cloudrc.wire.records import FAILURES, Control, MissionEnd, MissionEvent, MissionState, UnderWay
 
 
 @dataclass(frozen=True, slots=True)

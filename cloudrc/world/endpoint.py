@@ -17,9 +17,13 @@ from __future__ import annotations
 
 from math import hypot, isnan, nan
 
-from cloudrc.geometry.rays import scan_record
-from cloudrc.geometry.scene import is_obstacle
-from cloudrc.messages import (
+from cloudrc.physics.geometry.rays import scan_record
+from cloudrc.physics.geometry.scene import is_obstacle
+from cloudrc.physics.sim.scan import Scanner
+from cloudrc.physics.sim.simulator import Simulator
+from cloudrc.physics.sim.target import MovingTarget
+from cloudrc.results.metrics.definitions import real_time_factor
+from cloudrc.wire.messages import (
     NEVER_NS,
     Command,
     Datagram,
@@ -30,8 +34,7 @@ from cloudrc.messages import (
     Start,
     Telemetry,
 )
-from cloudrc.metrics.definitions import real_time_factor
-from cloudrc.records import (
+from cloudrc.wire.records import (
     REAL_TIME_FACTOR_MIN,
     Arrival,
     CommandApplied,
@@ -44,14 +47,11 @@ from cloudrc.records import (
     SessionOpened,
     TelemetrySent,
 )
-from cloudrc.sim.scan import Scanner
-from cloudrc.sim.simulator import Simulator
-from cloudrc.sim.target import MovingTarget
-from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import REPEATED, USED
-from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
-from cloudrc.tunnel.end import Identity, TunnelEnd
-from cloudrc.tunnel.handshake import ServerHandshake
+from cloudrc.wire.tunnel import codec
+from cloudrc.wire.tunnel.channel import REPEATED, USED
+from cloudrc.wire.tunnel.codec import DecodeError, Direction, Hello, Kind
+from cloudrc.wire.tunnel.end import Identity, TunnelEnd
+from cloudrc.wire.tunnel.handshake import ServerHandshake
 from cloudrc.world.filming import Film
 from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.sensors import Sensors

@@ -14,9 +14,9 @@ from functools import partial
 from typing import NamedTuple, Protocol
 
 from cloudrc.config.camera import CameraConfig
-from cloudrc.endpoint import Outcome, Worker
-from cloudrc.messages import PIECE_MAX, FramePiece
-from cloudrc.pictures import Decoder, Encoded, Encoder, Image, psnr
+from cloudrc.wire.endpoint import Outcome, Worker
+from cloudrc.wire.messages import PIECE_MAX, FramePiece
+from cloudrc.wire.pictures import Decoder, Encoded, Encoder, Image, psnr
 
 
 class Renderer(Protocol):

@@ -7,14 +7,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from cloudrc.errors import describe_error
-from cloudrc.messages import Command, GuardState, OperatorRequest, Vector
-from cloudrc.outside.code import FAILURES, check_failure, locate, stack_of
-from cloudrc.outside.values import RESULT, InvalidValueError
-from cloudrc.records import Fault
-from cloudrc.sim.onboard import Commands, Onboard
-from cloudrc.sim.readings import Readings
-from cloudrc.sim.simulator import Simulator
+from cloudrc.base.errors import describe_error
+from cloudrc.base.outside.code import FAILURES, check_failure, locate, stack_of
+from cloudrc.base.outside.values import RESULT, InvalidValueError
+from cloudrc.physics.sim.onboard import Commands, Onboard
+from cloudrc.physics.sim.readings import Readings
+from cloudrc.physics.sim.simulator import Simulator
+from cloudrc.wire.messages import Command, GuardState, OperatorRequest, Vector
+from cloudrc.wire.records import Fault
 from cloudrc.world.guard.state import Guard
 
 STEP_NS = 2_000_000

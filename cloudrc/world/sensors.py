@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cloudrc.config import disturbances
-from cloudrc.messages import ZERO, Odometry, Vector
-from cloudrc.sim.simulator import turned
+from cloudrc.physics.sim.simulator import turned
+from cloudrc.wire.messages import ZERO, Odometry, Vector
 
 
 class Errors(NamedTuple):

@@ -9,7 +9,7 @@ import shlex
 import pytest
 import yaml
 
-from cloudrc.cli.parser import build_parser
+from cloudrc.doors.cli.parser import build_parser
 from tests.chart.conftest import CHART, containers, notes, of_kind, pod_specs, render
 from tests.chart.test_render import OLDEST, helm
 

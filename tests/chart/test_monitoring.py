@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cloudrc.exposition.table import METRICS, MetricKind
+from cloudrc.results.exposition.table import METRICS, MetricKind
 from tests.chart.conftest import CHART, OPERATOR, ROOT, notes, of_kind, render
 from tools.dashboards import expressions
 

@@ -7,7 +7,7 @@ import shlex
 
 import pytest
 
-from cloudrc.cli.parser import build_parser
+from cloudrc.doors.cli.parser import build_parser
 from tests.chart.conftest import (
     containers,
     notes,

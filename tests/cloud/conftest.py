@@ -7,7 +7,7 @@ from cloudrc.cloud.controllers.pid import build as pid
 from cloudrc.cloud.estimators.running_mean import build as running_mean
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.predictors.last_sample import build as last_sample
-from cloudrc.messages import (
+from cloudrc.wire.messages import (
     NEVER_NS,
     UPRIGHT,
     ZERO,

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloudrc.assembly import assemble
 from cloudrc.cloud.compute_time import ComputeTime
 from cloudrc.config.load import load_experiment
-from cloudrc.records import Arrival, Control, Fault
+from cloudrc.flight.assembly import assemble
+from cloudrc.wire.records import Arrival, Control, Fault
 from tests.flights.conftest import fly_on
 
 MS = 1_000_000

@@ -20,7 +20,7 @@ from cloudrc.cloud.predictors import Predictor
 from cloudrc.config.overrides import OUTSIDE
 from cloudrc.config.robot import facts
 from cloudrc.config.schema import World
-from cloudrc.messages import UPRIGHT, ZERO, Command, Odometry, Setpoint
+from cloudrc.wire.messages import UPRIGHT, ZERO, Command, Odometry, Setpoint
 
 PELICAN, X2 = facts(World(), 12.0), facts(World(robot="x2"), 4.0)
 KINDS = {

@@ -9,7 +9,7 @@ import pytest
 
 from cloudrc.cloud.perceptions import Scan, point_at, yaw_of
 from cloudrc.cloud.perceptions.gap import build, reach
-from cloudrc.messages import ZERO, Odometry
+from cloudrc.wire.messages import ZERO, Odometry
 
 ANGLES = np.radians(np.arange(-135.0, 136.0, 1.5))
 

@@ -12,7 +12,7 @@ from cloudrc.cloud.estimators import Estimator
 from cloudrc.cloud.estimators.running_mean import RunningMean
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.predictors.last_sample import LastSample
-from cloudrc.messages import ZERO
+from cloudrc.wire.messages import ZERO
 from tests.cloud.conftest import HERE, MS, Integrating, command, loop, telemetry
 
 ONE = (1.0, 0.0, 0.0)

@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cloudrc.base.errors import MissingPrerequisiteError
 from cloudrc.cloud.controllers.mpc import build
 from cloudrc.cloud.planar import Planar
 from cloudrc.cloud.predictors.command_history import FirstOrder
 from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import Response, RobotFacts
-from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
+from cloudrc.wire.messages import UPRIGHT, ZERO, Odometry, Setpoint
 
 SPEED, ACCELERATION = 2.0, 4.0
 RESPONSE = Response(time_constant=(0.2,) * 3, dead_time=(0.1,) * 3, gain=(1.0,) * 3)

@@ -8,8 +8,8 @@ from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.news import SendOnDelta
 from cloudrc.cloud.predictors import Model
 from cloudrc.cloud.predictors.last_sample import LastSample
-from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
-from cloudrc.records import UNSENT
+from cloudrc.wire.messages import UPRIGHT, ZERO, GuardState, Odometry
+from cloudrc.wire.records import UNSENT
 from tests.cloud.conftest import MS, command, loop, planned, telemetry
 from tests.flights.conftest import both_ways, fly, numbers
 

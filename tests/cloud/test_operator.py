@@ -4,10 +4,10 @@
 
 import pytest
 
-from cloudrc import assembly
 from cloudrc.cloud.operator import REPEAT_NS, EmergencyStopRepeater
 from cloudrc.config.load import load_experiment
-from cloudrc.messages import GuardState, OperatorRequest, Request
+from cloudrc.flight import assembly
+from cloudrc.wire.messages import GuardState, OperatorRequest, Request
 
 ESTOP, TRACK = GuardState.ESTOP, GuardState.TRACK
 

@@ -7,11 +7,11 @@ from math import inf, nan
 import numpy as np
 import pytest
 
+from cloudrc.base.outside.values import InvalidValueError
 from cloudrc.cloud.perceiving import Here, Perceiver
 from cloudrc.cloud.perceptions import Perception
-from cloudrc.geometry.fence import Fence
-from cloudrc.messages import UPRIGHT, ZERO, Odometry, RangeScan, Setpoint
-from cloudrc.outside.values import InvalidValueError
+from cloudrc.physics.geometry.fence import Fence
+from cloudrc.wire.messages import UPRIGHT, ZERO, Odometry, RangeScan, Setpoint
 from tests.cloud.conftest import MS
 
 FENCE = Fence((-2.0, -2.0, 0.0), (2.0, 2.0, 2.0))

@@ -5,7 +5,7 @@
 import pytest
 
 from cloudrc.cloud.controllers import pid
-from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
+from cloudrc.wire.messages import UPRIGHT, ZERO, Odometry, Setpoint
 
 DT = 0.01
 ONES = (1.0, 1.0, 1.0)

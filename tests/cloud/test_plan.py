@@ -11,7 +11,7 @@ from cloudrc.cloud.controllers import Controller, ControlOutput, Planned
 from cloudrc.cloud.controllers.pid import build as pid
 from cloudrc.cloud.predictors import Model
 from cloudrc.cloud.predictors.last_sample import LastSample
-from cloudrc.messages import UPRIGHT, ZERO, Motion, Odometry, Setpoint
+from cloudrc.wire.messages import UPRIGHT, ZERO, Motion, Odometry, Setpoint
 from tests.cloud.conftest import HERE, MS, Integrating, command, loop
 
 

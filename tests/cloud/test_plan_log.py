@@ -5,8 +5,8 @@
 import pytest
 
 from cloudrc.cloud.plan_log import PlanLog
-from cloudrc.messages import ZERO, Command
-from cloudrc.records import PlanFollowed
+from cloudrc.wire.messages import ZERO, Command
+from cloudrc.wire.records import PlanFollowed
 from tests.cloud.conftest import MS, telemetry
 
 

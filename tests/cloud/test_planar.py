@@ -4,11 +4,11 @@
 
 import pytest
 
+from cloudrc.base.outside.values import InvalidValueError
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.controllers.pid import build
 from cloudrc.cloud.planar import Planar
-from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
-from cloudrc.outside.values import InvalidValueError
+from cloudrc.wire.messages import UPRIGHT, ZERO, Odometry, Setpoint
 
 SEEN = Odometry(0, (0.0, 0.0, 0.0993), UPRIGHT, (0.2, 0.0, 0.004), ZERO)
 GOAL = Setpoint((1.0, 2.0, 0.1), velocity=(0.5, 0.0, 1e-5))

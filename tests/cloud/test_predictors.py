@@ -7,7 +7,7 @@ from math import pi, sqrt
 import pytest
 
 from cloudrc.cloud.predictors import commanded_velocity, constant_acceleration, constant_velocity
-from cloudrc.messages import UPRIGHT, Command, Odometry
+from cloudrc.wire.messages import UPRIGHT, Command, Odometry
 
 HALF = sqrt(0.5)
 SAMPLE = Odometry(1_000_000_000, (1.0, 2.0, 3.0), UPRIGHT, (0.5, -1.0, 2.0), (0.0, 0.0, pi / 2))

@@ -10,8 +10,8 @@ import pytest
 from cloudrc.cloud.receiving import WINDOW, FrameReceiver
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.messages import FramePiece
-from cloudrc.tunnel.codec import Kind
+from cloudrc.wire.messages import FramePiece
+from cloudrc.wire.tunnel.codec import Kind
 
 IMAGE = np.zeros((2, 2, 3), np.uint8)
 

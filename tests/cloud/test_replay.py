@@ -12,7 +12,7 @@ from cloudrc.cloud.predictors import command_history, kalman, model_based
 from cloudrc.cloud.predictors._history import Replay
 from cloudrc.config.robot import facts
 from cloudrc.config.schema import World
-from cloudrc.messages import UPRIGHT, ZERO, Command, Odometry
+from cloudrc.wire.messages import UPRIGHT, ZERO, Command, Odometry
 from tests.cloud.conftest import MS, planned
 
 PELICAN = facts(World(), 12.0)

@@ -12,7 +12,7 @@ from cloudrc.cloud.perceptions import Frame
 from cloudrc.cloud.perceptions.target import build
 from cloudrc.config.robot import facts
 from cloudrc.config.schema import World
-from cloudrc.messages import ZERO, Odometry
+from cloudrc.wire.messages import ZERO, Odometry
 
 X2 = facts(World(robot="x2"), 4.0)
 WIDTH, HEIGHT, FOVY = 320, 240, radians(60)

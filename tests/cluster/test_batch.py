@@ -9,12 +9,12 @@ import subprocess
 import pytest
 
 from cloudrc import __version__
+from cloudrc.base.errors import BadInputError
 from cloudrc.cluster import batch, client
 from cloudrc.cluster.batch import PodSettings
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import UID_LABEL
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import BadInputError
 from tests.cluster.conftest import pod, terminated
 from tests.conftest import nightly
 

@@ -4,11 +4,11 @@
 
 import pytest
 
+from cloudrc.base.errors import MissingPrerequisiteError, TimedOutError
 from cloudrc.cluster import client
 from cloudrc.cluster.client import ClusterError, Release, connect
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import find_pod
-from cloudrc.errors import MissingPrerequisiteError, TimedOutError
 from tests.cluster.conftest import MISSION, pod, terminated
 
 

@@ -6,10 +6,10 @@ import re
 
 import pytest
 
+from cloudrc.base.outside.prometheus import read_metrics
 from cloudrc.cluster import incidents
 from cloudrc.cluster.diagnosis import diagnose, is_suspicious
 from cloudrc.cluster.incidents import find_causes, observe
-from cloudrc.outside.prometheus import read_metrics
 from tests.cluster.conftest import OUT_OF_MEMORY, deployment, pod, terminated, waiting
 
 SENT = 'cloudrc_datagrams_total{direction="%s",outcome="sent"}'

@@ -6,9 +6,9 @@ import shutil
 
 import pytest
 
-from cloudrc.cli import doctor as checks
 from cloudrc.cluster import client
 from cloudrc.cluster.client import ClusterError, Release
+from cloudrc.doors.cli import doctor as checks
 from tests.cluster.conftest import CONFIG_PLACE, kubeconfig
 
 

@@ -16,12 +16,12 @@ from cloudrc.cluster.flight import chart_values, loaded_tag
 from cloudrc.cluster.jobs import run_job
 from cloudrc.config.load import load_experiment
 from cloudrc.config.shipped import FOLDERS
-from cloudrc.geometry.scene import SCENES
-from cloudrc.record.writer import McapWriter
-from cloudrc.records import LinkChanged
+from cloudrc.physics.geometry.scene import SCENES
+from cloudrc.results.record.writer import McapWriter
+from cloudrc.wire.records import LinkChanged
 from tests.cluster.conftest import missions_of, terminated
 from tests.flights.conftest import records
-from tests.record.conftest import later
+from tests.results.record.conftest import later
 
 SECOND = 1_000_000_000
 NAME, SETTING = "hover", "mission.waypoints.0.dwell_s=1.0"
@@ -57,7 +57,7 @@ BEFORE = {"metrics": {"allowFrom": ["x"]}, "mission": {"enabled": True, "queue":
 def ready(running, teleop, pretend, tmp_path, monkeypatch):
     """A release whose pods have recorded a flight."""
     monkeypatch.setattr(flight, "FLUSH", 0.0)
-    monkeypatch.setattr("cloudrc.report.write._draw", lambda *given, **wanted: None)
+    monkeypatch.setattr("cloudrc.results.report.write._draw", lambda *given, **wanted: None)
     monkeypatch.chdir(tmp_path)
     world, _ = flown()
     record(tmp_path, flown(), (later(world[-300:], SECOND), []), torn=True)

@@ -9,15 +9,15 @@ from unittest.mock import Mock
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.cluster import kept
 from cloudrc.cluster.client import Release
-from cloudrc.errors import BadInputError
-from cloudrc.record.columns import Recording
-from cloudrc.record.merge import cut_to_last_mission, merge
-from cloudrc.report.folder import read_run
+from cloudrc.results.record.columns import Recording
+from cloudrc.results.record.merge import cut_to_last_mission, merge
+from cloudrc.results.report.folder import read_run
 from cloudrc.teleop.store import MissionRecord
 from tests.cluster.test_flight import flown, record
-from tests.record.conftest import later
+from tests.results.record.conftest import later
 
 SECOND = 1_000_000_000
 HOUR = 3600 * SECOND
@@ -97,7 +97,7 @@ def test_the_oldest_reports_go(data, monkeypatch):
 
 
 def test_the_end_of_a_long_recording_is_read_in_little_memory(data, monkeypatch):
-    monkeypatch.setattr("cloudrc.record.reader.TRIM_EVERY", 100)
+    monkeypatch.setattr("cloudrc.results.record.reader.TRIM_EVERY", 100)
     whole = Recording.read(data / "cloud.mcap")
     end = Recording.read(data / "cloud.mcap", last_ns=60 * SECOND)
     assert len(end.messages) < 0.6 * len(whole.messages)

@@ -7,10 +7,10 @@ import sys
 
 import pytest
 
-from cloudrc.cli.main import main
 from cloudrc.cluster import flight
-from cloudrc.drivers import local
-from cloudrc.runs.missions import read_mission
+from cloudrc.doors.cli.main import main
+from cloudrc.flight.runs.missions import read_mission
+from cloudrc.results import under_way
 from tests.cluster.conftest import TOKEN, missions_of, pod, terminated
 
 WAYPOINTS = "waypoints: [{position_m: [0.5, 0.0, 1.0]}]"
@@ -117,7 +117,7 @@ def test_a_deleted_job_cancels_its_mission_if_it_still_flies(
 @pytest.fixture
 def flies_here(tmp_path):
     """A run on this machine whose API does not answer."""
-    with local.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
+    with under_way.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
         yield
 
 

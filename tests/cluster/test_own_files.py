@@ -6,10 +6,10 @@ import shutil
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.cluster.own_files import find_own_files, send_own_files
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import FOLDERS
-from cloudrc.errors import BadInputError
 
 MESHES = """<mujoco><compiler meshdir="meshes"/><asset><mesh name="arm" file="arm.stl"/></asset>
 <worldbody/></mujoco>"""

@@ -7,11 +7,11 @@ import re
 
 import pytest
 
+from cloudrc.base.errors import TimedOutError
 from cloudrc.cluster import pods
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.pods import list_pods, operator_token, pod_failure
-from cloudrc.errors import TimedOutError
 from tests.cluster.conftest import OUT_OF_MEMORY, TOKEN, deployment, pod, waiting
 
 

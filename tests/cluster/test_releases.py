@@ -7,10 +7,10 @@ from unittest.mock import Mock
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import run_job
 from cloudrc.cluster.releases import only_release
-from cloudrc.errors import BadInputError
 from tests.cluster.conftest import MISSION, deployment, labels
 
 

@@ -4,9 +4,9 @@
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import BadInputError
-from cloudrc.outside.reuse import reuse_results
 
 
 def refused(name, *settings):

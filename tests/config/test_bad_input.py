@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.profile import load_profile
-from cloudrc.errors import BadInputError
 from tests.config.conftest import refused, refused_line
 
 

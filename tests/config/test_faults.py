@@ -4,12 +4,12 @@
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment, load_link
 from cloudrc.config.resolved import dump, fingerprint
-from cloudrc.errors import BadInputError
-from cloudrc.messages import GuardState
-from cloudrc.runs.experiment import check_mode
-from cloudrc.runs.flight import fly_in_memory
+from cloudrc.flight.runs.experiment import check_mode
+from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.wire.messages import GuardState
 from tests.config.conftest import refused_line
 
 KILLED = "kind: cloud_killed, at_s: 4, duration_s: 0.8"

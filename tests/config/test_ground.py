@@ -8,8 +8,8 @@ from math import pi
 import pytest
 
 import cloudrc
-from cloudrc.assembly import build_plan
 from cloudrc.config.load import load_experiment
+from cloudrc.flight.assembly import build_plan
 from cloudrc.teleop.models import RefusedError, RequestReader
 from tests.config.conftest import refused, refused_line
 

@@ -6,9 +6,9 @@ from math import radians
 
 import pytest
 
-from cloudrc.assembly import build_plan
 from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
+from cloudrc.flight.assembly import build_plan
 from tests.config.conftest import refused_line
 
 

@@ -4,10 +4,10 @@
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment, load_link
 from cloudrc.config.profile import load_profile
 from cloudrc.config.resolved import dump
-from cloudrc.errors import BadInputError
 
 
 @pytest.fixture

@@ -10,16 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.outside import document
+from cloudrc.base.outside.document import parse_value
 from cloudrc.config import shipped
 from cloudrc.config.load import load_experiment, read_experiment
 from cloudrc.config.profile import load_profile
 from cloudrc.config.resolved import dump, fingerprint
 from cloudrc.config.robot import find_robot
-from cloudrc.errors import BadInputError
-from cloudrc.geometry.scene import SCENES, load_scene
 from cloudrc.link.traces import link_profile
-from cloudrc.outside import document
-from cloudrc.outside.document import parse_value
+from cloudrc.physics.geometry.scene import SCENES, load_scene
 from tests.config.conftest import refused_line
 
 PROFILES = shipped.names("profile")

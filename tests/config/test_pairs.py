@@ -12,10 +12,10 @@ from itertools import combinations, product
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import dump
 from cloudrc.config.schema import Experiment
-from cloudrc.errors import BadInputError
 from tests.conftest import nightly
 from tests.support.keys import forms_of
 

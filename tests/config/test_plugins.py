@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from cloudrc import plugins
+from cloudrc.base import plugins
 from cloudrc.config.choice import PlugIn
 from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import build_plugin

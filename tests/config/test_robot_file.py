@@ -4,8 +4,8 @@
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.robot import find_robot
-from cloudrc.errors import BadInputError
 
 
 @pytest.fixture

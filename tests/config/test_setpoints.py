@@ -4,8 +4,8 @@
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.setpoints import read_setpoints, write_setpoints
-from cloudrc.errors import BadInputError
 from tests.fences import FENCE
 
 HERE, THERE = (0.0, 0.0, 1.0), (0.5, 0.0, 1.2)

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 
-from cloudrc.assembly import build_links
+from cloudrc.base.outside.document import Document
 from cloudrc.config.link_edit import edit_profile
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import dump, fingerprint
 from cloudrc.config.time_line import describe_one_time_line, find_ways, link_start
-from cloudrc.outside.document import Document
+from cloudrc.flight.assembly import build_links
 from tests.config.conftest import refused_line
 
 HANDOVER = "link.profile=handover"

@@ -14,14 +14,14 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from cloudrc.base.errors import CloudrcError
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import METRICS, fetch_recording, forwarded
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import CloudrcError
-from cloudrc.runs.links.verify import fetch
-from tests.drivers.conftest import WORK, slower
+from cloudrc.flight.runs.links.verify import fetch
+from tests.flight.drivers.conftest import WORK, slower
 from tests.support.commands import python
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,11 +10,10 @@ import time
 
 import pytest
 
-from cloudrc.cli.mission import LEASE
 from cloudrc.cluster.pods import fetch_recording
-from cloudrc.messages import GuardState
-from cloudrc.record.columns import Recording
-from tests.drivers.conftest import ages_at_hold
+from cloudrc.doors.cli.mission import LEASE
+from cloudrc.results.record.columns import Recording
+from cloudrc.wire.messages import GuardState
 from tests.e2e.conftest import (
     NAME,
     PIPES,
@@ -31,6 +30,7 @@ from tests.e2e.conftest import (
     until_ready,
     value,
 )
+from tests.flight.drivers.conftest import ages_at_hold
 
 pytestmark = pytest.mark.real_time
 

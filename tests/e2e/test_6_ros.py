@@ -8,7 +8,7 @@ import re
 import pytest
 import yaml
 
-from cloudrc.messages import GuardState
+from cloudrc.wire.messages import GuardState
 from tests.e2e.conftest import (
     CHART,
     EXAMPLES,

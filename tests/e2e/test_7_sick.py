@@ -9,10 +9,10 @@ from contextlib import contextmanager
 
 import pytest
 
+from cloudrc.base.errors import CloudrcError
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.incidents import find_causes
-from cloudrc.errors import CloudrcError
 from tests.conftest import nightly_rows
 from tests.e2e.conftest import CHART, apply, cloudrc, command, eventually, helm, kubectl
 

@@ -20,10 +20,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from cloudrc.base.text import table
 from cloudrc.config import shipped
 from cloudrc.config.schema import World
-from cloudrc.runs.interrupts import interrupt_on_signals
-from cloudrc.text import table
+from cloudrc.flight.runs.interrupts import interrupt_on_signals
 from tests.faults.search import fly_seed, search, search_rows, search_summary, store
 from tests.faults.trial import TrialResult
 

@@ -17,10 +17,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from cloudrc.base.outside.refusal import check_names
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
-from cloudrc.geometry.fence import Fence
-from cloudrc.messages import (
+from cloudrc.physics.geometry.fence import Fence
+from cloudrc.teleop.wire import Output, RobotStatus
+from cloudrc.wire.messages import (
     MISSION_OVER,
     ZERO,
     Command,
@@ -31,9 +33,7 @@ from cloudrc.messages import (
     Start,
     Vector,
 )
-from cloudrc.outside.refusal import check_names
-from cloudrc.records import Control, Fault
-from cloudrc.teleop.wire import Output, RobotStatus
+from cloudrc.wire.records import Control, Fault
 from cloudrc.world.robot import STEP_NS
 from tests.faults.schedule import DURATION, PAPER, Schedule, compose, generator
 

@@ -13,7 +13,6 @@ from itertools import chain
 from pathlib import Path
 from typing import TypeVar
 
-from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
@@ -22,18 +21,19 @@ from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import is_planar
 from cloudrc.config.scene import steered_in
 from cloudrc.config.schema import World
-from cloudrc.drivers.teleop import PERIOD_NS as WAKE_NS
-from cloudrc.drivers.virtual import Clock, VirtualRun
-from cloudrc.endpoint import Endpoint
+from cloudrc.flight import assembly
+from cloudrc.flight.drivers.teleop import PERIOD_NS as WAKE_NS
+from cloudrc.flight.drivers.virtual import Clock, VirtualRun
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
-from cloudrc.messages import GuardState
-from cloudrc.record.columns import Recording
-from cloudrc.records import Counted, GuardChange, MissionEvent, Record
+from cloudrc.results.record.columns import Recording
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import MissionRecord, Order
-from cloudrc.tunnel.end import Identity
-from cloudrc.tunnel.keys import KeyRing, KeySet
+from cloudrc.wire.endpoint import Endpoint
+from cloudrc.wire.messages import GuardState
+from cloudrc.wire.records import Counted, GuardChange, MissionEvent, Record
+from cloudrc.wire.tunnel.end import Identity
+from cloudrc.wire.tunnel.keys import KeyRing, KeySet
 from cloudrc.world.endpoint import WorldEndpoint
 from cloudrc.world.robot import Robot
 from tests.faults.adversary import DishonestLoop, HostileOperator, Lie, dishonesty

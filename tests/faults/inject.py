@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cloudrc.drivers.virtual import Clock
+from cloudrc.flight.drivers.virtual import Clock
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
-from cloudrc.messages import Command
-from cloudrc.records import Control
 from cloudrc.teleop.service import MissionService
-from cloudrc.tunnel.keys import Key, KeySet
+from cloudrc.wire.messages import Command
+from cloudrc.wire.records import Control
+from cloudrc.wire.tunnel.keys import Key, KeySet
 from tests.faults.adversary import Lie
 from tests.faults.models import Tamper
 from tests.faults.schedule import FaultEvent, Schedule, generator

@@ -39,9 +39,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.messages import GuardState
-from cloudrc.records import CommandApplied, Record, SessionOpened
-from cloudrc.text import describe_point
+from cloudrc.base.text import describe_point
+from cloudrc.wire.messages import GuardState
+from cloudrc.wire.records import CommandApplied, Record, SessionOpened
 from cloudrc.world.robot import STEP, STEP_NS
 from tests.faults.observer import LONG_NS, ROW, RobotObserver
 from tests.faults.rules import ESTOP, FLOWN, HOLD, LAND, TRACK, Breach, Rules

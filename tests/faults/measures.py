@@ -13,9 +13,11 @@ from itertools import pairwise
 from math import dist, hypot, isfinite, nan
 from typing import Any, Literal, TypeAlias
 
-from cloudrc.messages import Cause, GuardState
-from cloudrc.record.columns import Recording
-from cloudrc.records import (
+from cloudrc.results.record.columns import Recording
+from cloudrc.results.report.document import Run
+from cloudrc.results.report.write import assess
+from cloudrc.wire.messages import Cause, GuardState
+from cloudrc.wire.records import (
     CommandApplied,
     Fault,
     GroundTruth,
@@ -23,8 +25,6 @@ from cloudrc.records import (
     Record,
     SessionOpened,
 )
-from cloudrc.report.document import Run
-from cloudrc.report.write import assess
 from tests.faults.adversary import Lie
 from tests.faults.flight import FaultRun
 from tests.faults.schedule import Schedule, generator

@@ -9,17 +9,17 @@ from contextlib import suppress
 from functools import partial
 from typing import TypeAlias
 
-from cloudrc.drivers.faults import RestartableEndpoint
-from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop, TeleopLoop, UnixPeer
-from cloudrc.drivers.virtual import Clock
-from cloudrc.endpoint import Endpoint
-from cloudrc.geometry.fence import Fence
-from cloudrc.messages import NEVER_NS, Datagram
-from cloudrc.records import Fault, MissionEvent, Record
+from cloudrc.flight.drivers.faults import RestartableEndpoint
+from cloudrc.flight.drivers.teleop import PERIOD_NS, RemoteTeleop, TeleopLoop, UnixPeer
+from cloudrc.flight.drivers.virtual import Clock
+from cloudrc.physics.geometry.fence import Fence
 from cloudrc.teleop.refusals import ConflictError, UnavailableError
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import MissionRecord, MissionStore, Order, connect
 from cloudrc.teleop.wire import ALARM, Message
+from cloudrc.wire.endpoint import Endpoint
+from cloudrc.wire.messages import NEVER_NS, Datagram
+from cloudrc.wire.records import Fault, MissionEvent, Record
 
 CFS_PERIOD = 0.1  # period of the kernel's CPU quota [s]
 UNIX_SOCKET_MAX = 11

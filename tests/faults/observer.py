@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.messages import PLAN_STEP_NS, Command, GuardState, OperatorRequest, Request, Start
-from cloudrc.records import Contact
-from cloudrc.sim.onboard import Commands
-from cloudrc.sim.readings import Readings
+from cloudrc.physics.sim.onboard import Commands
+from cloudrc.physics.sim.readings import Readings
+from cloudrc.wire.messages import PLAN_STEP_NS, Command, GuardState, OperatorRequest, Request, Start
+from cloudrc.wire.records import Contact
 from cloudrc.world.robot import Observer, Robot
 from tests.faults.rules import ESTOP, FLOWN, GROUND, HOLD, LAND, LATCHED, TRACK, Breach, Rules
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import find_robot
 from cloudrc.config.scene import scene_of
-from cloudrc.geometry.obstacles import fence_of
-from cloudrc.messages import GuardState
+from cloudrc.physics.geometry.obstacles import fence_of
+from cloudrc.wire.messages import GuardState
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 FLOWN, LATCHED = (TRACK, HOLD, LAND), (LAND, ESTOP)

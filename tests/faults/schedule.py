@@ -11,10 +11,10 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import ConfigDict, Field, RootModel
 
+from cloudrc.base.outside.document import read_document, write_yaml
+from cloudrc.base.text import unknown_name_text
 from cloudrc.config.problems import validate
 from cloudrc.config.schema import World
-from cloudrc.outside.document import read_document, write_yaml
-from cloudrc.text import unknown_name_text
 
 
 def generator(seed: int, use: int) -> np.random.Generator:

@@ -11,8 +11,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from cloudrc.errors import CloudrcError
-from cloudrc.trials.workers import map_in_order, take_each
+from cloudrc.base.errors import CloudrcError
+from cloudrc.flight.trials.workers import map_in_order, take_each
 from tests.faults import trial
 from tests.faults.adversary import choose
 from tests.faults.schedule import compose, dump

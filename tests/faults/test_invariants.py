@@ -10,9 +10,9 @@ from types import SimpleNamespace
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.messages import ZERO, Command, OperatorRequest, Request, Start
-from cloudrc.records import Contact
 from cloudrc.robots.pelican.rotors import STOPPED
+from cloudrc.wire.messages import ZERO, Command, OperatorRequest, Request, Start
+from cloudrc.wire.records import Contact
 from tests.faults.invariants import FlightSteps
 from tests.faults.observer import RobotObserver
 from tests.faults.rules import ESTOP, FLOWN, GROUND, HOLD, LAND, TRACK, Rules

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.trials.workers import WorkerDiedError
+from cloudrc.flight.trials.workers import WorkerDiedError
 from tests.faults.__main__ import main
 from tests.faults.rules import Breach
 from tests.faults.schedule import Schedule, load

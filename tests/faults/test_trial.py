@@ -9,10 +9,10 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.cloud.operator import EmergencyStopRepeater
-from cloudrc.messages import ZERO
-from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
-from cloudrc.tunnel.channel import LATE, USED, ReceiveWindow
+from cloudrc.wire.messages import ZERO
+from cloudrc.wire.records import CommandApplied, SessionOpened
+from cloudrc.wire.tunnel.channel import LATE, USED, ReceiveWindow
 from cloudrc.world.guard import limits
 from cloudrc.world.guard.hold import PositionHold
 from cloudrc.world.guard.state import Guard
@@ -38,7 +38,7 @@ def test_a_schedule_that_found_a_bug_breaks_nothing_now(path):
 
 @pytest.mark.parametrize("seed", nightly(*range(2, 9)))
 def test_random_faults_break_no_invariant(seed):
-    """Seed 1 is flown daily by the command, in tests/cli."""
+    """Seed 1 is flown daily by the command, in tests/doors/cli."""
     assert fly(compose(seed)).breaches == ()
 
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cloudrc.errors import describe_error
+from cloudrc.base.errors import describe_error
+from cloudrc.base.text import escape
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.wire import QUEUED
-from cloudrc.text import escape
 from tests.faults.flight import FaultRun
 from tests.faults.inject import order
 from tests.faults.invariants import FlightSteps

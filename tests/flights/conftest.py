@@ -6,9 +6,11 @@ from collections import Counter
 from functools import lru_cache
 from types import SimpleNamespace
 
-from cloudrc import assembly
 from cloudrc.config.load import load_experiment
-from cloudrc.messages import (
+from cloudrc.flight import assembly
+from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.results.record.columns import Recording, RecordStore
+from cloudrc.wire.messages import (
     UPRIGHT,
     ZERO,
     Cause,
@@ -19,15 +21,13 @@ from cloudrc.messages import (
     Request,
     Start,
 )
-from cloudrc.record.columns import Recording, RecordStore
-from cloudrc.records import Counted, GuardChange, TelemetrySent
-from cloudrc.runs.flight import fly_in_memory
-from cloudrc.tunnel import codec
-from cloudrc.tunnel.codec import DecodeError, Direction, Kind
-from cloudrc.tunnel.end import Identity
-from cloudrc.tunnel.handshake import ClientHandshake
-from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.session import Session
+from cloudrc.wire.records import Counted, GuardChange, TelemetrySent
+from cloudrc.wire.tunnel import codec
+from cloudrc.wire.tunnel.codec import DecodeError, Direction, Kind
+from cloudrc.wire.tunnel.end import Identity
+from cloudrc.wire.tunnel.handshake import ClientHandshake
+from cloudrc.wire.tunnel.keys import Key, KeyRing, KeySet
+from cloudrc.wire.tunnel.session import Session
 from cloudrc.world.endpoint import WorldEndpoint
 
 MS = 1_000_000

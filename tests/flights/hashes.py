@@ -18,7 +18,7 @@ import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-from cloudrc.cli.main import main
+from cloudrc.doors.cli.main import main
 from tests.faults.scenarios import SCENARIOS
 
 FILE = Path(__file__).with_name("hashes.json")

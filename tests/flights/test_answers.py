@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from cloudrc.metrics.budget import budget_of
+from cloudrc.results.metrics.budget import budget_of
 from tests.flights.conftest import both_ways, fly
 
 pytestmark = pytest.mark.usefixtures("shared_files")

@@ -2,7 +2,8 @@
 
 """Pictures of the robot's camera reach cloud, as late as the link lets them; the rest stays.
 
-A camera that draws when a picture was taken stands in for the renderer, which `tests/sim` has.
+A camera that draws when a picture was taken stands in for the renderer, which
+`tests/physics/sim` has.
 """
 
 from functools import cache
@@ -11,18 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloudrc import assembly
-from cloudrc.assembly import build_cloud, build_links, build_world, start_mission
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import dump
-from cloudrc.drivers.virtual import VirtualRun
-from cloudrc.errors import BadInputError
-from cloudrc.metrics.age import describe, sawtooth
-from cloudrc.pictures import make_decoder
-from cloudrc.record.columns import Recording, RecordStore
-from cloudrc.record.writer import McapWriter
-from cloudrc.runs.flight import fly_in_memory
-from cloudrc.tunnel.end import Identity
+from cloudrc.flight import assembly
+from cloudrc.flight.assembly import build_cloud, build_links, build_world, start_mission
+from cloudrc.flight.drivers.virtual import VirtualRun
+from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.results.metrics.age import describe, sawtooth
+from cloudrc.results.record.columns import Recording, RecordStore
+from cloudrc.results.record.writer import McapWriter
+from cloudrc.wire.pictures import make_decoder
+from cloudrc.wire.tunnel.end import Identity
 from tests.conftest import nightly
 from tests.flights.conftest import ring, sha256
 from tests.support.camera import needs_renderer
@@ -64,7 +65,7 @@ def time_in(image):
 
 @pytest.fixture(autouse=True)
 def clock(monkeypatch):
-    monkeypatch.setattr("cloudrc.sim.camera.Camera", Clock)
+    monkeypatch.setattr("cloudrc.physics.sim.camera.Camera", Clock)
 
 
 def load(*settings):
@@ -202,7 +203,7 @@ def test_a_loss_costs_h264_all_pictures_up_to_the_next_key_frame():
 
 @pytest.mark.parametrize("queue", ["fifo", "priority", "newest"])
 def test_a_cell_with_priority_sends_telemetry_before_pictures(queue):
-    from cloudrc.runs.fleet import assemble_fleet
+    from cloudrc.flight.runs.fleet import assemble_fleet
 
     cell = ("cell.rate_kbit=900", f"cell.queue={queue}")
     settings = (*cell, "link.profile=ideal", "camera.quality=95")
@@ -222,7 +223,7 @@ def test_a_cell_with_priority_sends_telemetry_before_pictures(queue):
 
 PERCEPTION = """
 from cloudrc.cloud.perceptions import Frame, Perception
-from cloudrc.messages import Setpoint
+from cloudrc.wire.messages import Setpoint
 
 class Sees(Perception):
     takes = {takes!r}
@@ -345,9 +346,9 @@ def test_a_recording_gives_back_the_pictures(tmp_path):
 def test_a_flight_without_a_camera_loads_no_renderer_and_no_codec():
     program = (
         "import sys; from cloudrc.config.load import load_experiment as load;"
-        "from cloudrc.runs.flight import fly_in_memory as fly;"
+        "from cloudrc.flight.runs.flight import fly_in_memory as fly;"
         f"fly(load('hover', ['world.robot=x2', 'world.scene=empty', '{BRIEF}']));"
-        "print({'cloudrc.sim.camera', 'av', 'OpenGL', 'mujoco.egl'} & sys.modules.keys())"
+        "print({'cloudrc.physics.sim.camera', 'av', 'OpenGL', 'mujoco.egl'} & sys.modules.keys())"
     )
     found = python("-c", program)
     assert found.stdout == "set()\n", found.stderr

@@ -4,7 +4,7 @@
 
 import pytest
 
-from cloudrc.tunnel.codec import Kind, peek
+from cloudrc.wire.tunnel.codec import Kind, peek
 from tests.faults.flight import FaultRun
 from tests.faults.schedule import Schedule
 

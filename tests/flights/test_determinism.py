@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.assembly import assemble, build_cloud, build_links, build_world, start_mission
 from cloudrc.config.load import load_experiment
-from cloudrc.drivers.virtual import VirtualRun
-from cloudrc.record.columns import Recording, RecordStore
-from cloudrc.tunnel.codec import DecodeError
-from cloudrc.tunnel.end import Identity
+from cloudrc.flight.assembly import assemble, build_cloud, build_links, build_world, start_mission
+from cloudrc.flight.drivers.virtual import VirtualRun
+from cloudrc.results.record.columns import Recording, RecordStore
+from cloudrc.wire.tunnel.codec import DecodeError
+from cloudrc.wire.tunnel.end import Identity
 from tests.flights.conftest import both_ways, ring, sha256
 from tests.support.commands import python
 
@@ -104,12 +104,12 @@ WALL = re.compile(
     r"|from time import|\bdate(time)?\.(now|utcnow|today)\b"
 )
 """What reads a wall clock."""
-CONTROL_PATH = ("world/", "cloud/", "teleop/", "tunnel/", "link/", "endpoint", "drivers/")
+CONTROL_PATH = ("world/", "cloud/", "teleop/", "wire/", "link/", "flight/drivers/")
 ALLOWED = {
     # The kernel stamps datagrams and probes by this clock; only ages of 0 to 50 ms are used.
     *("link/carry/udp.py", "link/verify/probe.py"),
     # Only people read these times.
-    *("drivers/process.py", "link/follow.py"),
+    *("flight/drivers/process.py", "link/follow.py"),
 }
 
 

@@ -7,14 +7,14 @@ from math import radians
 import numpy as np
 import pytest
 
-from cloudrc.geometry.vectors import turn_to
-from cloudrc.messages import ZERO, GuardState
-from cloudrc.record.columns import Recording
-from cloudrc.records import Arrival, CommandApplied, Control, TelemetrySent
-from cloudrc.report.document import Run
-from cloudrc.report.write import write_report
+from cloudrc.physics.geometry.vectors import turn_to
+from cloudrc.results.record.columns import Recording
+from cloudrc.results.report.document import Run
+from cloudrc.results.report.write import write_report
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.wire import Leg
+from cloudrc.wire.messages import ZERO, GuardState
+from cloudrc.wire.records import Arrival, CommandApplied, Control, TelemetrySent
 from tests.conftest import nightly, nightly_rows
 from tests.faults.flight import FaultRun
 from tests.faults.schedule import Schedule, generator

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from cloudrc.records import CommandApplied, Fault, GroundTruth
+from cloudrc.wire.records import CommandApplied, Fault, GroundTruth
 from tests.flights.conftest import MS, talking
 
 talk = pytest.fixture(talking)

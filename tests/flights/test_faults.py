@@ -8,10 +8,10 @@ import pytest
 
 from cloudrc.config.faults import FaultConfig
 from cloudrc.config.load import load_experiment
-from cloudrc.drivers.faults import faulty_clock
-from cloudrc.drivers.virtual import Clock
-from cloudrc.messages import GuardState
-from cloudrc.runs.flight import fly_in_memory
+from cloudrc.flight.drivers.faults import faulty_clock
+from cloudrc.flight.drivers.virtual import Clock
+from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.wire.messages import GuardState
 
 pytestmark = pytest.mark.usefixtures("shared_files")
 

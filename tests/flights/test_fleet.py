@@ -5,12 +5,12 @@
 import numpy as np
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import BadInputError
-from cloudrc.processes.ends import EndSettings, open_end
-from cloudrc.record.columns import Recording, RecordStore, datagrams
-from cloudrc.runs.experiment import check_mode, robots_of
-from cloudrc.runs.fleet import assemble_fleet
+from cloudrc.flight.processes.ends import EndSettings, open_end
+from cloudrc.flight.runs.experiment import check_mode, robots_of
+from cloudrc.flight.runs.fleet import assemble_fleet
+from cloudrc.results.record.columns import Recording, RecordStore, datagrams
 from tests.config.conftest import refused
 from tests.conftest import nightly_rows
 from tests.flights.conftest import sha256

@@ -7,10 +7,10 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from cloudrc.assembly import build_plan, with_order
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import BadInputError
-from cloudrc.runs.flight import fly_in_memory
+from cloudrc.flight.assembly import build_plan, with_order
+from cloudrc.flight.runs.flight import fly_in_memory
 from cloudrc.teleop.models import RequestReader
 from tests.support.camera import needs_renderer
 

@@ -7,10 +7,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from cloudrc.geometry.clearance import inside_tube
-from cloudrc.geometry.scene import load_scene
-from cloudrc.messages import GuardState
-from cloudrc.records import GroundTruth
+from cloudrc.physics.geometry.clearance import inside_tube
+from cloudrc.physics.geometry.scene import load_scene
+from cloudrc.wire.messages import GuardState
+from cloudrc.wire.records import GroundTruth
 from tests.conftest import nightly_rows
 from tests.faults import measures
 from tests.faults.flight import FaultRun

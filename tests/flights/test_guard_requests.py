@@ -6,9 +6,9 @@ from math import nan
 
 import pytest
 
-from cloudrc.exposition.live import LiveMetrics
-from cloudrc.messages import ZERO, Cause, GuardState, Request, Start
-from cloudrc.records import CommandApplied, Contact, GuardChange, SessionOpened
+from cloudrc.results.exposition.live import LiveMetrics
+from cloudrc.wire.messages import ZERO, Cause, GuardState, Request, Start
+from cloudrc.wire.records import CommandApplied, Contact, GuardChange, SessionOpened
 from tests.flights.conftest import MS, Bare, ring, talking
 
 

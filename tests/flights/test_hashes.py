@@ -17,7 +17,7 @@ HERE = platform.system(), platform.machine()
 @pytest.mark.skipif(HERE != ("Linux", "x86_64"), reason="the hashes are those of one processor")
 @pytest.mark.parametrize("name", [*DAILY, *nightly(*(each for each in LINES if each not in DAILY))])
 def test_a_command_records_what_it_did(name, monkeypatch):
-    monkeypatch.setattr("cloudrc.eval.page.write_page", lambda *_: None)
+    monkeypatch.setattr("cloudrc.studies.eval.page.write_page", lambda *_: None)
     line = LINES[name]
     assert fly(line["command"]) == line["records_sha256"], "if this is meant: make hashes"
 

@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.report.write import assess
-from cloudrc.runs.flight import fly_in_memory
+from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.results.report.write import assess
 
 TRACK = "time_s,x_m,y_m,z_m\n0,0,0,1\n1.5,0,0,1\n2.5,1.5,0,1\n4,1.5,0,1\n"
 """Up, and then 1.5 m ahead. Setpoints of a file are not checked before the flight."""

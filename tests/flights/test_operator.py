@@ -6,12 +6,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from cloudrc import assembly
 from cloudrc.config.load import load_experiment
-from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
-from cloudrc.records import UNDER_WAY, Counted, GuardChange, MissionEvent
+from cloudrc.flight import assembly
 from cloudrc.teleop.wire import ALARM
-from cloudrc.tunnel.codec import Kind, peek
+from cloudrc.wire.messages import GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.wire.records import UNDER_WAY, Counted, GuardChange, MissionEvent
+from cloudrc.wire.tunnel.codec import Kind, peek
 from tests.flights.conftest import HOVER, both_ways, fly_on
 
 S = 1_000_000_000

@@ -4,9 +4,9 @@
 
 import pytest
 
-from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import MissionConfig
+from cloudrc.flight import assembly
 from tests.conftest import nightly
 from tests.flights.conftest import fly, numbers
 

@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloudrc import assembly
-from cloudrc.assembly import build_cloud, build_links, build_world, start_mission
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
-from cloudrc.drivers.virtual import VirtualRun
-from cloudrc.errors import BadInputError
-from cloudrc.geometry.rays import ranges_of
-from cloudrc.record.columns import Recording, RecordStore
-from cloudrc.record.writer import McapWriter
-from cloudrc.records import Perceived, ScanTaken
-from cloudrc.runs.flight import fly_in_memory
-from cloudrc.tunnel.end import Identity
+from cloudrc.flight import assembly
+from cloudrc.flight.assembly import build_cloud, build_links, build_world, start_mission
+from cloudrc.flight.drivers.virtual import VirtualRun
+from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.physics.geometry.rays import ranges_of
+from cloudrc.results.record.columns import Recording, RecordStore
+from cloudrc.results.record.writer import McapWriter
+from cloudrc.wire.records import Perceived, ScanTaken
+from cloudrc.wire.tunnel.end import Identity
 from tests.flights.conftest import ring
 
 pytestmark = pytest.mark.usefixtures("shared_files")

@@ -4,9 +4,9 @@
 
 import numpy as np
 
+from cloudrc.flight.runs.links.trace import one_way
 from cloudrc.link.trace_logs import trace_of
 from cloudrc.link.traces import write_trace
-from cloudrc.runs.links.trace import one_way
 from tests.flights.conftest import fly
 
 

@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import pytest
 
-from cloudrc.messages import GuardState
-from cloudrc.tunnel.keys import Key, KeySet
+from cloudrc.wire.messages import GuardState
+from cloudrc.wire.tunnel.keys import Key, KeySet
 from tests.faults.flight import FaultRun
 from tests.faults.inject import SECRET
 from tests.faults.measures import epochs

@@ -6,8 +6,8 @@ from itertools import product
 
 import pytest
 
-from cloudrc.records import Arrival
-from cloudrc.tunnel.codec import Kind
+from cloudrc.wire.records import Arrival
+from cloudrc.wire.tunnel.codec import Kind
 from tests.flights.conftest import Bare, both_ways, fly, ring
 
 pytestmark = pytest.mark.usefixtures("shared_files")
@@ -105,7 +105,7 @@ def test_no_interleaving_of_all_actions_reverts_a_command():
 
 
 def test_the_check_finds_reverted_commands(monkeypatch):
-    monkeypatch.setattr("cloudrc.tunnel.channel.ReceiveWindow.take", lambda *_: "used")
+    monkeypatch.setattr("cloudrc.wire.tunnel.channel.ReceiveWindow.take", lambda *_: "used")
     with pytest.raises(AssertionError):
         explore(BASIC, 4)
 

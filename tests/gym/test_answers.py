@@ -11,10 +11,10 @@ import pytest
 from cloudrc.gym import Networked
 from cloudrc.gym.ages import describe_ages
 from cloudrc.gym.answers import CUTS, NEVER_NS, to_document
-from cloudrc.timeline.loops import of_document
-from cloudrc.timeline.text import as_text
-from cloudrc.timeline.trace import write_trace
-from tests.timeline.test_trace import check_rules
+from cloudrc.results.timeline.loops import of_document
+from cloudrc.results.timeline.text import as_text
+from cloudrc.results.timeline.trace import write_trace
+from tests.results.timeline.test_trace import check_rules
 
 MS = 1_000_000
 LINK = {"uplink": {"delay_ms": 130}, "downlink": {"delay_ms": 60}}

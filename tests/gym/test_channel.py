@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from cloudrc.errors import BadInputError
+from cloudrc.base.errors import BadInputError
 from cloudrc.gym import Channel, Networked, NetworkedVector, Waiting
 from cloudrc.gym.schedules import change_of, find_schedule
 from examples import channel as page

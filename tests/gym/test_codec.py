@@ -14,10 +14,10 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.base.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.gym import Channel, Networked, NetworkedVector
 from cloudrc.gym.doubts import LinkWarning
-from cloudrc.pictures import Jpeg, psnr
+from cloudrc.wire.pictures import Jpeg, psnr
 from tests.gym.envs import Counter, Mixed, both_ways
 
 

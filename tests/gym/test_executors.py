@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from cloudrc import plugins
-from cloudrc.errors import BadInputError
+from cloudrc.base import plugins
+from cloudrc.base.errors import BadInputError
 from cloudrc.gym import Networked
 from tests.gym.envs import Counter, both_ways
 from tests.support.pages import blocks

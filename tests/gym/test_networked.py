@@ -13,7 +13,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 
-from cloudrc.errors import BadInputError
+from cloudrc.base.errors import BadInputError
 from cloudrc.gym import Networked, NetworkedVector
 from cloudrc.gym.doubts import LinkWarning
 from cloudrc.gym.linear import Linear

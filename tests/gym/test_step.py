@@ -6,7 +6,7 @@ import gymnasium
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
-from cloudrc.errors import BadInputError
+from cloudrc.base.errors import BadInputError
 from cloudrc.gym import Networked, NetworkedVector
 from cloudrc.gym.step import find_step
 from tests.gym.envs import Counter

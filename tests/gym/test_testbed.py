@@ -9,9 +9,9 @@ from gymnasium.utils.env_checker import check_env
 
 import cloudrc
 import cloudrc.gym
-from cloudrc.errors import BadInputError
+from cloudrc.base.errors import BadInputError
 from cloudrc.gym import Networked
-from cloudrc.record.columns import Recording
+from cloudrc.results.record.columns import Recording
 
 SHORT = {"mission": {"steps": {"count": 2}}}
 NEAR = {"mission.waypoints": [{"position_m": [0.8, 0.6], "tolerance_m": 0.2, "dwell_s": 0.5}]}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
-from cloudrc.errors import BadInputError
+from cloudrc.base.errors import BadInputError
 from cloudrc.gym import Networked, NetworkedVector
 from cloudrc.gym.asked import Met, PartsAsked
 from cloudrc.gym.lane import Wire

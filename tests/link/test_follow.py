@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.errors import BadInputError
-from cloudrc.files import write_atomically
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.files import write_atomically
+from cloudrc.flight.processes.link import make_profile_loader
 from cloudrc.link.follow import PeerName, Profiles
 from cloudrc.link.state import ChangeFacts
-from cloudrc.processes.link import make_profile_loader
 
 LOAD = make_profile_loader("uplink", Path("none.yaml"), 1)
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cloudrc.base.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.config.profile import load_profile
 from cloudrc.config.shipped import names
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.draws import Purpose, shape, stream_key
 from cloudrc.link.netem import STRETCH, Netem, check, explain, limit, options, table, write_table
 from cloudrc.link.profile import Timeline, Trace

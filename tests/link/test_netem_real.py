@@ -14,17 +14,17 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from cloudrc.base.errors import MissingPrerequisiteError
 from cloudrc.config.profile import load_profile
 from cloudrc.config.shipped import names
-from cloudrc.drivers.programs import Programs
-from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.flight.drivers.programs import Programs
+from cloudrc.flight.runs.links.under_test import DEVICE, HOSTS, _namespaces, inside
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.netem import STRETCH, Netem, table
 from cloudrc.link.profile import Trace
 from cloudrc.link.streams import numbers, sample
 from cloudrc.link.traces import link_profile
-from cloudrc.runs.links.under_test import DEVICE, HOSTS, _namespaces, inside
-from cloudrc.tunnel.codec import Kind
+from cloudrc.wire.tunnel.codec import Kind
 from tests.link.profiles import blackout, changed, in_bursts, profile_of
 
 MINUTES = [

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 import cloudrc.link
-from cloudrc.cli.eval_values import check_round_trips
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import dump
-from cloudrc.errors import BadInputError
-from cloudrc.eval.setup import Episode, EvalSetup, link_at
+from cloudrc.doors.cli.eval_values import check_round_trips
 from cloudrc.gym.asked import expected
 from cloudrc.gym.lane import DATAGRAMS, Wire
 from cloudrc.link.carry.tcp.medium import Medium
@@ -22,6 +21,7 @@ from cloudrc.link.library import LinkProfile
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile, Radio
 from cloudrc.link.radio import RadioParts, repetitions, schedule
+from cloudrc.studies.eval.setup import Episode, EvalSetup, link_at
 from tests.link.profiles import changed, profile_of
 
 MS, US = 1_000_000, 1_000

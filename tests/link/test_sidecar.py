@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.base.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.sidecar import Sidecar
 from cloudrc.link.state import ChangeFacts

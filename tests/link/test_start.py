@@ -7,7 +7,7 @@ from math import sqrt
 import pytest
 
 from cloudrc import link
-from cloudrc.errors import BadInputError
+from cloudrc.base.errors import BadInputError
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.opportunities import Opportunities
 from cloudrc.link.profile import Timeline

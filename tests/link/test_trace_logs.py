@@ -8,7 +8,8 @@ from math import isnan, nan
 import numpy as np
 import pytest
 
-from cloudrc.errors import BadInputError
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.outside.values import InvalidValueError
 from cloudrc.link.trace_logs import (
     Packets,
     is_ping,
@@ -17,7 +18,6 @@ from cloudrc.link.trace_logs import (
     read_ping,
     trace_of,
 )
-from cloudrc.outside.values import InvalidValueError
 
 
 def read(text, *, halve=False):

@@ -4,7 +4,7 @@
 
 import pytest
 
-from cloudrc.errors import BadInputError
+from cloudrc.base.errors import BadInputError
 from cloudrc.link.profile import Trace
 from cloudrc.link.traces import parse_trace, read_trace, write_trace
 

@@ -6,9 +6,9 @@ import json
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import World
-from cloudrc.errors import BadInputError
 from cloudrc.robots.build import check_robot
 
 CONTROLLER = find_robot("pelican").onboard.name

@@ -5,9 +5,9 @@
 import pytest
 
 import cloudrc
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.robot import find_robot
-from cloudrc.errors import BadInputError
-from cloudrc.messages import GuardState
+from cloudrc.wire.messages import GuardState
 from tests.robots.conftest import HOVER
 
 FAILS = """
@@ -56,7 +56,7 @@ def actuators(model, dt):
 
 FASTER = """
 from cloudrc.robots.onboard.multirotor import build
-from cloudrc.sim.onboard import Accelerator
+from cloudrc.physics.sim.onboard import Accelerator
 from cloudrc.world.robot import Robot
 
 

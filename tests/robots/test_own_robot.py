@@ -5,8 +5,8 @@
 import pytest
 
 import cloudrc
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.robot import find_robot
-from cloudrc.errors import BadInputError
 from tests.robots.conftest import CONTROLLER, HOVER
 
 SENSORS = "sensors: {contact_force: {unit: N, sensor: tip}}"

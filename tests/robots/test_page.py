@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.main import main
+from cloudrc.doors.cli.main import main
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "robot.md").read_text()
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", PAGE, re.DOTALL)

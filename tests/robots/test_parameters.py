@@ -7,7 +7,7 @@ import pytest
 import cloudrc
 from cloudrc.config import shipped
 from cloudrc.config.robot import find_robot
-from cloudrc.metrics.velocity_loop import identify, series
+from cloudrc.results.metrics.velocity_loop import identify, series
 from cloudrc.robots.build import check_robot
 from tests.conftest import nightly
 from tests.robots.conftest import refused, world

@@ -7,12 +7,12 @@ import json
 import pytest
 
 import cloudrc
+from cloudrc.base.errors import BadInputError
 from cloudrc.cloud.results import is_ours
 from cloudrc.config.choice import PlugIn
 from cloudrc.config.overrides import build_plugin, onboard_values
 from cloudrc.config.robot import facts, known_robot
 from cloudrc.config.schema import World
-from cloudrc.errors import BadInputError
 from tests.conftest import nightly
 
 GROUND = {"steps": {"count": 3, "centre_m": [0, 0, 0.1], "range_m": [1.5, 1.5, 0]}}

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 import cloudrc
+from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import World
-from cloudrc.outside.reuse import reuse_results
+from cloudrc.physics.sim.airframe import read_airframe
+from cloudrc.physics.sim.scene import compile_model
 from cloudrc.robots import build
 from cloudrc.robots.build import build_robot
-from cloudrc.sim.airframe import read_airframe
-from cloudrc.sim.scene import compile_model
 
 STEPS = {"mission.steps.count": 3, "link.profile": "paper-p2"}
 

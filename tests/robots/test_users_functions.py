@@ -4,8 +4,8 @@
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import BadInputError
 from cloudrc.robots.build import check_robot
 from cloudrc.robots.check import check
 

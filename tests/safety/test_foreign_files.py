@@ -10,18 +10,18 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc import files
+from cloudrc.base import files
+from cloudrc.base.errors import BadInputError
+from cloudrc.base.files import atomic_file, write_atomically
 from cloudrc.config.load import read_experiment
 from cloudrc.config.profile import load_profile
-from cloudrc.errors import BadInputError
-from cloudrc.files import atomic_file, write_atomically
+from cloudrc.flight.trials.plan import read_plan
 from cloudrc.link.traces import read_trace
-from cloudrc.record.columns import Recording
-from cloudrc.report.figures import FIGURES
-from cloudrc.report.folder import read_run
-from cloudrc.report.write import write_report
-from cloudrc.trials.plan import read_plan
-from tests.record.conftest import cloud_records, world_records, write
+from cloudrc.results.record.columns import Recording
+from cloudrc.results.report.figures import FIGURES
+from cloudrc.results.report.folder import read_run
+from cloudrc.results.report.write import write_report
+from tests.results.record.conftest import cloud_records, world_records, write
 
 
 @pytest.fixture(autouse=True)
@@ -115,7 +115,7 @@ def test_a_failed_write_leaves_no_trace(theirs):
 
 
 def test_a_report_follows_no_link(theirs, mine, tmp_path, monkeypatch):
-    monkeypatch.setattr("cloudrc.report.figures.FIGURES", {"error": FIGURES["error"]})
+    monkeypatch.setattr("cloudrc.results.report.figures.FIGURES", {"error": FIGURES["error"]})
     (theirs / "config.yaml").write_text("seed: 1")
     write(theirs / "world.mcap", world_records(20))
     write(theirs / "cloud.mcap", cloud_records(20))

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.main import main
 from cloudrc.config.choice import PlugIn
 from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import dump
-from cloudrc.drivers.machine import interpreter
-from cloudrc.processes import ends
-from cloudrc.report.figures import FIGURES
-from cloudrc.runs.links.verify import find_experiment
-from cloudrc.trials.workers import map_in_order
-from tests.metrics.conftest import flown
-from tests.record.conftest import write_mission
+from cloudrc.doors.cli.main import main
+from cloudrc.flight.drivers.machine import interpreter
+from cloudrc.flight.processes import ends
+from cloudrc.flight.runs.links.verify import find_experiment
+from cloudrc.flight.trials.workers import map_in_order
+from cloudrc.results.report.figures import FIGURES
+from tests.results.metrics.conftest import flown
+from tests.results.record.conftest import write_mission
 
 pytestmark = pytest.mark.promise("foreign-files-run-nothing")
 CONFIG = """\
@@ -31,7 +31,7 @@ report:
   metrics: ./spy.py
 """
 
-PACKAGE = Path(ends.__file__).parents[1]
+PACKAGE = Path(ends.__file__).parents[2]
 
 
 @pytest.fixture
@@ -61,8 +61,8 @@ def run(tmp_path, spy):
 
 
 def test_a_report_executes_nothing_of_the_run(run, trace, monkeypatch):
-    monkeypatch.setattr("cloudrc.report.page.b64encode", lambda svg: b"")  # a smaller page
-    monkeypatch.setattr("cloudrc.report.figures.FIGURES", {"error": FIGURES["error"]})
+    monkeypatch.setattr("cloudrc.results.report.page.b64encode", lambda svg: b"")  # a smaller page
+    monkeypatch.setattr("cloudrc.results.report.figures.FIGURES", {"error": FIGURES["error"]})
     assert main(["report", str(run)]) == 1
     assert not trace.exists()
     assert json.loads((run / "report.json").read_text())["experiment"] == "config"
@@ -108,11 +108,11 @@ def modules_with(text):
 
 def test_plug_ins_and_processes_begin_only_where_they_should():
     """All code that does not fly uses `read_experiment`, which imports no plug-in."""
-    flies = {"runs/experiment.py", "processes/ends.py", "runs/bench.py", "reproduce/flights.py"}
-    flies |= {"exercise/checks.py"}
+    flies = {f"flight/{name}.py" for name in ("runs/experiment", "processes/ends", "runs/bench")}
+    flies |= {"studies/reproduce/flights.py", "studies/exercise/checks.py"}
     flies |= {"cluster/survey.py"}  # values with a plug-in by name; files are not looked at
     assert modules_with("load_experiment(") == flies | {"config/load.py"}
-    assert modules_with("sys.executable") == {"drivers/machine.py"}
+    assert modules_with("sys.executable") == {"flight/drivers/machine.py"}
 
 
 def test_a_new_process_imports_nothing_from_the_working_folder(run, trace, spy, monkeypatch):
@@ -130,7 +130,7 @@ def test_a_worker_imports_nothing_from_the_working_folder(run, trace, spy, monke
     (run / "pickle.py").write_text(spy)
     monkeypatch.chdir(run)
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
-    monkeypatch.setattr("cloudrc.trials.workers.usable_cores", lambda: 2)
+    monkeypatch.setattr("cloudrc.flight.trials.workers.usable_cores", lambda: 2)
     assert list(map_in_order(abs, [-1, -2], 2)) == [1, 2]
     assert not trace.exists()
     assert not os.environ.get("PYTHONSAFEPATH")

@@ -4,8 +4,8 @@
 
 import pytest
 
+from cloudrc.flight.trials.fleet import plan_fleet
 from cloudrc.studies.capacity import capacity_of, search
-from cloudrc.trials.fleet import plan_fleet
 
 SHORT = (
     *("mission.steps.count=8", "mission.steps.period_s=0.5"),

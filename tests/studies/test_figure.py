@@ -6,8 +6,8 @@ import json
 
 import pytest
 
-from cloudrc.report.figures.bands import Panel, Point, draw
-from cloudrc.report.figures.style import Look
+from cloudrc.results.report.figures.bands import Panel, Point, draw
+from cloudrc.results.report.figures.style import Look
 from cloudrc.studies.compare import of_sweep
 from cloudrc.studies.figure import draw_sweep
 from cloudrc.studies.sweep import read_flights
@@ -79,7 +79,7 @@ def test_values_over_two_decades_have_a_logarithmic_axis_in_a_unit_between_them(
     ],
 )
 def test_a_figure_has_words_in_place_of_keys_and_explains_hollow_markers(key, words, monkeypatch):
-    monkeypatch.setattr("cloudrc.report.figures.bands.PRINT_KINDS", ("svg",))
+    monkeypatch.setattr("cloudrc.results.report.figures.bands.PRINT_KINDS", ("svg",))
     panel = Panel("error", "m", {"a": [Point(1.0, 1.0, 1.0, 1.0, failed=True)]}, is_log=True)
     svg = draw([panel], key, [], "cloud.predictor", look=Look())["svg"].decode()
     for text in (words, "error (m)", "predictor", "hollow: a flight failed"):

@@ -6,11 +6,11 @@ import json
 
 import pytest
 
-from cloudrc import assembly
-from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
+from cloudrc.doors.cli.main import main
+from cloudrc.flight import assembly
 from cloudrc.studies.place import DISTURBANCES, PlaceStudy, judge
-from tests.cli.conftest import SHORT
+from tests.doors.cli.conftest import SHORT
 
 
 @pytest.fixture(autouse=True)

@@ -7,10 +7,10 @@ import json
 
 import pytest
 
-from cloudrc import source
-from cloudrc.errors import BadInputError
+from cloudrc.base import source
+from cloudrc.base.errors import BadInputError
+from cloudrc.flight.trials.plan import read_plan
 from cloudrc.studies import sweep
-from cloudrc.trials.plan import read_plan
 from tests.support.sweeps import flown
 
 PLUG_IN = {
@@ -116,7 +116,7 @@ def test_other_code_flies_nothing_into_the_folder(write_sweep, folder, monkeypat
     path = write_sweep()
     fly(path, folder, slice(1), (1, 2))
     said = f"its flights are of code {source.code_hash()}, this is code 0123456789abcdef"
-    monkeypatch.setattr("cloudrc.source.code_hash", lambda: "0123456789abcdef")
+    monkeypatch.setattr("cloudrc.base.source.code_hash", lambda: "0123456789abcdef")
     with pytest.raises(BadInputError, match=said):
         fly(path, folder, shard=(2, 2))
 

@@ -2,8 +2,8 @@
 
 """Telemetry of a robot that stands still, as world records it."""
 
-from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
-from cloudrc.records import TelemetrySent
+from cloudrc.wire.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
+from cloudrc.wire.records import TelemetrySent
 
 
 def told(stamp_ns, guard=GuardState.TRACK, **fields):

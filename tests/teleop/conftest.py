@@ -15,14 +15,12 @@ from urllib.request import Request as HttpRequest
 
 import pytest
 
-from cloudrc.assembly import build_plan
+from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.cloud.operator import EmergencyStopRepeater
 from cloudrc.config.hull import hull_of
 from cloudrc.config.load import read_experiment
-from cloudrc.geometry.scene import load_scene
-from cloudrc.messages import UPRIGHT, Cause, GuardState, OperatorRequest, Request, Setpoint, Start
-from cloudrc.outside.reuse import reuse_results
-from cloudrc.records import Fault, MissionEvent
+from cloudrc.flight.assembly import build_plan
+from cloudrc.physics.geometry.scene import load_scene
 from cloudrc.teleop import store
 from cloudrc.teleop.api import STARTING, ApiServer, Bridge, create_app
 from cloudrc.teleop.auth import Gate, Tokens
@@ -32,6 +30,16 @@ from cloudrc.teleop.refusals import ConflictError, UnavailableError
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import MissionStore, Order
 from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
+from cloudrc.wire.messages import (
+    UPRIGHT,
+    Cause,
+    GuardState,
+    OperatorRequest,
+    Request,
+    Setpoint,
+    Start,
+)
+from cloudrc.wire.records import Fault, MissionEvent
 from tests.conftest import wait_until
 from tests.fences import FENCE
 from tests.support.http import ask

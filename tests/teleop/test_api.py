@@ -10,15 +10,15 @@ import time
 
 import pytest
 
-from cloudrc.cli.teleop import api_address
-from cloudrc.exposition.live import LiveMetrics
-from cloudrc.messages import GuardState
-from cloudrc.records import Counted
+from cloudrc.doors.cli.teleop import api_address
+from cloudrc.results.exposition.live import LiveMetrics
 from cloudrc.teleop import api as api_module
 from cloudrc.teleop import auth, models
 from cloudrc.teleop.api import ApiServer, Bridge
 from cloudrc.teleop.client import Api, UnreachableError
 from cloudrc.teleop.refusals import ConflictError
+from cloudrc.wire.messages import GuardState
+from cloudrc.wire.records import Counted
 from tests.support.http import DIRECT
 from tests.teleop.conftest import (
     A_MISSION,

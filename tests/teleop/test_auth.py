@@ -8,7 +8,7 @@ import re
 
 import pytest
 
-from cloudrc.errors import BadInputError
+from cloudrc.base.errors import BadInputError
 from cloudrc.teleop.auth import Tokens
 from tests.teleop.conftest import A_MISSION, OPERATOR, READER, connect, running
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cloudrc.messages import ZERO, GuardState, Motion, Setpoint, Start
 from cloudrc.teleop.carrot import arrival_ns, setpoint_at
 from cloudrc.teleop.wire import Leg, Plan
+from cloudrc.wire.messages import ZERO, GuardState, Motion, Setpoint, Start
 from tests.teleop.conftest import PERIOD_NS, ServiceFlight, reference
 
 SECOND = 1_000_000_000

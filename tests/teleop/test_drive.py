@@ -16,10 +16,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.messages import ZERO, GuardState, Setpoint
 from cloudrc.teleop.carrot import ACCELERATION, setpoint_at, steer
 from cloudrc.teleop.refusals import ConflictError
 from cloudrc.teleop.wire import decode, encode
+from cloudrc.wire.messages import ZERO, GuardState, Setpoint
 from tests.fences import FENCE
 from tests.teleop.conftest import (
     AWAY,

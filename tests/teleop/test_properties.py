@@ -9,11 +9,11 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from cloudrc.messages import Setpoint, Start
-from cloudrc.records import MissionEvent
 from cloudrc.teleop.refusals import ConflictError, UnknownMissionError
 from cloudrc.teleop.store import Order
 from cloudrc.teleop.wire import Leg, Plan
+from cloudrc.wire.messages import Setpoint, Start
+from cloudrc.wire.records import MissionEvent
 from tests.teleop.conftest import ServiceFlight
 
 UNDER_WAY = {"starting", "flying", "held"}

@@ -8,11 +8,11 @@ from math import dist, inf, nan
 import pytest
 
 from cloudrc.config.schema import Touch
-from cloudrc.messages import Cause, GuardState, Setpoint, Start
 from cloudrc.teleop.refusals import ConflictError
 from cloudrc.teleop.store import Order
 from cloudrc.teleop.view import NO_CLOUD, NOT_HEARD
 from cloudrc.teleop.wire import Leg, Plan
+from cloudrc.wire.messages import Cause, GuardState, Setpoint, Start
 from tests.teleop.conftest import (
     AWAY,
     FROM_SPAWN,

@@ -8,9 +8,8 @@ from contextlib import closing
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.schema import Touch
-from cloudrc.errors import BadInputError
-from cloudrc.messages import Start
 from cloudrc.teleop import models
 from cloudrc.teleop.refusals import UnavailableError, UnknownMissionError
 from cloudrc.teleop.store import (
@@ -23,6 +22,7 @@ from cloudrc.teleop.store import (
     open_store,
 )
 from cloudrc.teleop.wire import Leg, Plan
+from cloudrc.wire.messages import Start
 from tests.teleop.conftest import A, B, C, KilledError, ServiceFlight, play, service_flying
 
 PLAN = Plan((Leg(A, 0.1, float("inf"), 0.5, 3.0), Leg(B)), Start.HERE, 12.5)

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.messages import Cause, GuardState, OperatorRequest, Setpoint
-from cloudrc.records import MissionEvent
 from cloudrc.teleop.wire import RobotStatus, decode, encode, read_line, write_line
-from tests.console.conftest import control
+from cloudrc.wire.messages import Cause, GuardState, OperatorRequest, Setpoint
+from cloudrc.wire.records import MissionEvent
+from tests.doors.console.conftest import control
 
 messages = st.one_of(*map(st.from_type, (RobotStatus, Setpoint, OperatorRequest, MissionEvent)))
 

@@ -6,8 +6,8 @@ from math import cos, pi, radians, sin
 
 import pytest
 
-from cloudrc.messages import Start
 from cloudrc.teleop.wire import Leg, Plan
+from cloudrc.wire.messages import Start
 from tests.teleop.conftest import A, B, flying
 
 

@@ -4,9 +4,9 @@
 
 from cloudrc.config.robot import find_robot
 from cloudrc.config.shipped import file_of
+from cloudrc.physics.sim.scene import compile_model, compile_true
+from cloudrc.physics.sim.simulator import Simulator
 from cloudrc.robots.pelican.rotors import Rotors
-from cloudrc.sim.scene import compile_model, compile_true
-from cloudrc.sim.simulator import Simulator
 from cloudrc.world.robot import STEP
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from cloudrc.config.camera import CameraConfig
-from cloudrc.endpoint import Outcome
-from cloudrc.messages import PIECE_MAX
-from cloudrc.pictures import Encoded
+from cloudrc.wire.endpoint import Outcome
+from cloudrc.wire.messages import PIECE_MAX
+from cloudrc.wire.pictures import Encoded
 from cloudrc.world.filming import Film, TakenPicture
 
 IMAGE = np.zeros((2, 2, 3), np.uint8)

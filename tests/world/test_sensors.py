@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cloudrc.config import disturbances
-from cloudrc.messages import Odometry
+from cloudrc.wire.messages import Odometry
 from cloudrc.world.sensors import Sensors
 
 TRUTH = Odometry(5, (1.0, 2.0, 3.0), (0.6, 0.0, 0.8, 0.0), (4.0, 5.0, 6.0), (7.0, 8.0, 9.0))

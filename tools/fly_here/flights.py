@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import cloudrc
-from cloudrc.geometry.scene import Scene, load_scene
-from cloudrc.geometry.tubes import wall
-from cloudrc.metrics.control import ages_at_actuator
-from cloudrc.metrics.flight import Array
-from cloudrc.metrics.verdict import FlightFailure
-from cloudrc.trials.workers import map_in_order
+from cloudrc.flight.trials.workers import map_in_order
+from cloudrc.physics.geometry.scene import Scene, load_scene
+from cloudrc.physics.geometry.tubes import wall
+from cloudrc.results.metrics.control import ages_at_actuator
+from cloudrc.results.metrics.flight import Array
+from cloudrc.results.metrics.verdict import FlightFailure
 
 EXPERIMENT, SCENE, SEED = "fast", "pipes", 4
 """The seed has losses long enough for HOLD while the drone is under way."""

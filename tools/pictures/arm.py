@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cloudrc.report.figures.bands import Panel, Point, draw
-from cloudrc.report.figures.style import Look
-from cloudrc.statistics import exact_interval
+from cloudrc.base.statistics import exact_interval
+from cloudrc.results.report.figures.bands import Panel, Point, draw
+from cloudrc.results.report.figures.style import Look
 
 EPISODES = 20
 RTT_MS = 0, 50, 100, 150, 300, 600

@@ -17,9 +17,17 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 import cloudrc
-from cloudrc.metrics.control import ages_at_actuator
-from cloudrc.report.figures import own_settings
-from cloudrc.report.figures.style import BLACK, DOWNLINK, GREEN, GREY, UPLINK, VERMILION, Look
+from cloudrc.results.metrics.control import ages_at_actuator
+from cloudrc.results.report.figures import own_settings
+from cloudrc.results.report.figures.style import (
+    BLACK,
+    DOWNLINK,
+    GREEN,
+    GREY,
+    UPLINK,
+    VERMILION,
+    Look,
+)
 from tools.pictures.stage import (
     BLUE,
     GHOST,

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
-from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
+from cloudrc.wire.messages import ZERO, Odometry, Setpoint, Vector
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from cloudrc.base.errors import MissingPrerequisiteError
 from cloudrc.cloud.controllers import Controller, ControlOutput, Goals, Planned
 from cloudrc.cloud.controllers.pid import GAIN_YAW
 from cloudrc.cloud.motion import Body
@@ -24,9 +25,8 @@ from cloudrc.cloud.predictors import Model, rotate_ahead
 from cloudrc.cloud.predictors.command_history import Axes, FirstOrder
 from cloudrc.config.robot import RobotFacts
 from cloudrc.config.schema import NotNegative, Positive
-from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.geometry.vectors import turn_to
-from cloudrc.messages import PLAN_STEP_NS, Odometry, Quaternion, Setpoint, Vector
+from cloudrc.physics.geometry.vectors import turn_to
+from cloudrc.wire.messages import PLAN_STEP_NS, Odometry, Quaternion, Setpoint, Vector
 
 STEP = PLAN_STEP_NS * 1e-9
 """Time between two velocities of a plan [s]."""

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.config.schema import NotNegative, NotNegatives
-from cloudrc.geometry.vectors import turn_to
-from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
+from cloudrc.physics.geometry.vectors import turn_to
+from cloudrc.wire.messages import ZERO, Odometry, Setpoint, Vector
 
 GAIN_YAW = 0.8
 """Gain of the yaw if a waypoint asks for one [1/s]: that of x and y, so that delays have the same

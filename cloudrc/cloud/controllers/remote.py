@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from cloudrc.cloud.controllers import STAND_STILL, Controller, ControlOutput
 from cloudrc.config.schema import Positive, ServerUrl
-from cloudrc.messages import Odometry, Setpoint
+from cloudrc.wire.messages import Odometry, Setpoint
 
 Answer = tuple[float, Sequence[Sequence[float]]]
 """Age of the answered observation [s], and the rows vx, vy, vz [m/s], world frame, yaw rate [rad/s]

@@ -12,7 +12,7 @@ from typing import Any
 
 from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.config.schema import Positive, RosNamespace
-from cloudrc.messages import Odometry, Setpoint
+from cloudrc.wire.messages import Odometry, Setpoint
 
 
 class RosController(OutsideController):

@@ -14,9 +14,9 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.geometry.vectors import turn_to
-from cloudrc.messages import Odometry, Setpoint, Vector
-from cloudrc.rotation import rotate
+from cloudrc.physics.geometry.vectors import turn_to
+from cloudrc.wire.messages import Odometry, Setpoint, Vector
+from cloudrc.wire.rotation import rotate
 
 
 class Scan(NamedTuple):

@@ -19,8 +19,8 @@ import numpy as np
 
 from cloudrc.cloud.perceptions import Perception, Scan, point_at, yaw_of
 from cloudrc.config.schema import Positive
-from cloudrc.geometry.solids import Array
-from cloudrc.messages import Odometry, Setpoint
+from cloudrc.physics.geometry.solids import Array
+from cloudrc.wire.messages import Odometry, Setpoint
 
 
 class Gap(Perception):

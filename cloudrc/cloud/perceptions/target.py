@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from cloudrc.cloud.perceptions import Frame, Perception, place_of
 from cloudrc.config.robot import RobotFacts
 from cloudrc.config.schema import Positive
-from cloudrc.messages import Odometry, Setpoint, Vector
+from cloudrc.wire.messages import Odometry, Setpoint, Vector
 
 Colour = tuple[int, int, int]
 POINTS_MIN = 12

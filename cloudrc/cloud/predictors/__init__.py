@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from math import cos, sin, sqrt
 
-from cloudrc.messages import Command, Odometry, Quaternion, Vector
+from cloudrc.wire.messages import Command, Odometry, Quaternion, Vector
 
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 

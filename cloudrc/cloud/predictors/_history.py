@@ -16,7 +16,7 @@ from copy import copy
 
 from cloudrc.cloud.motion import Body
 from cloudrc.cloud.predictors import Model, Predictor, moved
-from cloudrc.messages import NEVER_NS, PLAN_STEP_NS, ZERO, Command, Odometry, Vector
+from cloudrc.wire.messages import NEVER_NS, PLAN_STEP_NS, ZERO, Command, Odometry, Vector
 
 PERIOD_NS = 10_000_000
 """Usual time between two samples or commands [ns]. Source: docs/reference/plant.md, "Commands"."""

@@ -12,14 +12,14 @@ from copy import copy
 from math import ceil, exp
 from pathlib import Path
 
+from cloudrc.base.outside.document import read_document
 from cloudrc.cloud.motion import Body
 from cloudrc.cloud.predictors._history import COUNT, PERIOD_NS, Replay
 from cloudrc.config.problems import validate
 from cloudrc.config.robot import DEFAULT_LIMITS, Response, RobotFacts
 from cloudrc.config.schema import Constants, DeadTimes, NotNegatives, Positive
-from cloudrc.geometry.vectors import step_towards
-from cloudrc.messages import ZERO, Command, Odometry, Vector
-from cloudrc.outside.document import read_document
+from cloudrc.physics.geometry.vectors import step_towards
+from cloudrc.wire.messages import ZERO, Command, Odometry, Vector
 
 Axes = tuple[Vector, ...]
 """Time constant [s], dead time [s] and gain [1] of x, y and z."""

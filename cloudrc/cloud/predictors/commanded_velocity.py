@@ -9,7 +9,7 @@ paper, eq. (3), multiplies the delay by the measured velocity.
 from __future__ import annotations
 
 from cloudrc.cloud.predictors import Predictor, moved
-from cloudrc.messages import ZERO, Command, Odometry
+from cloudrc.wire.messages import ZERO, Command, Odometry
 
 
 class CommandedVelocity(Predictor):

@@ -12,7 +12,7 @@ from collections import deque
 
 from cloudrc.cloud.predictors import Predictor, moved
 from cloudrc.config.schema import Positive
-from cloudrc.messages import ZERO, Odometry, Vector
+from cloudrc.wire.messages import ZERO, Odometry, Vector
 
 
 class ConstantAcceleration(Predictor):

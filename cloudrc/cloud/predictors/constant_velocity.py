@@ -8,7 +8,7 @@ Source: the paper, eqs. (2) and (3).
 from __future__ import annotations
 
 from cloudrc.cloud.predictors import Predictor, moved
-from cloudrc.messages import Odometry
+from cloudrc.wire.messages import Odometry
 
 
 class ConstantVelocity(Predictor):

@@ -23,7 +23,7 @@ from cloudrc.config.choice import PlugIn
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.robot import RobotFacts
 from cloudrc.config.schema import Positive
-from cloudrc.messages import Command, Odometry
+from cloudrc.wire.messages import Command, Odometry
 
 Array = NDArray[np.float64]
 Rows = tuple[tuple[float, float], tuple[float, float]]

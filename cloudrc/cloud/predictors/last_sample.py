@@ -8,7 +8,7 @@ Source: docs/reference/control.md, "Predictors", (a): the baseline for the other
 from __future__ import annotations
 
 from cloudrc.cloud.predictors import Predictor
-from cloudrc.messages import Odometry
+from cloudrc.wire.messages import Odometry
 
 
 class LastSample(Predictor):

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from copy import copy
 from typing import Any
 
-from cloudrc import plugins
+from cloudrc.base import plugins
 from cloudrc.cloud.motion import Body
 from cloudrc.cloud.predictors import command_history
 from cloudrc.cloud.predictors._history import Replay
@@ -23,7 +23,7 @@ from cloudrc.config.choice import PlugIn
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.robot import RobotFacts
 from cloudrc.config.schema import Positive
-from cloudrc.messages import Odometry
+from cloudrc.wire.messages import Odometry
 
 GAP_NS = 500_000_000
 """Time without odometry after which the model starts again [ns]."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from cloudrc import plugins
+from cloudrc.base import plugins
 
 plugins.provide("executors", __name__)
 

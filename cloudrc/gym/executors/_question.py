@@ -6,8 +6,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from cloudrc.base.outside.values import Quantity
 from cloudrc.gym.executors import Chunk, Executor
-from cloudrc.outside.values import Quantity
 
 PATIENCE = Quantity("s", gt=0.0, le=3600.0)
 """Time without an answer after which the robot asks again."""

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from cloudrc.base.outside.refusal import check_names
+from cloudrc.base.outside.values import Quantity
 from cloudrc.gym.executors import Chunk
 from cloudrc.gym.executors._question import OneQuestion
-from cloudrc.outside.refusal import check_names
-from cloudrc.outside.values import Quantity
 
 AGGREGATES = {"latest": 1.0, "weighted": 0.7, "average": 0.5, "conservative": 0.3}
 """Way to merge two actions of one number -> weight of the newer one [1]."""

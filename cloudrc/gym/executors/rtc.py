@@ -14,10 +14,10 @@ from __future__ import annotations
 
 from collections import deque
 
+from cloudrc.base.outside.values import Quantity
 from cloudrc.gym.executors import Chunk, Committed
 from cloudrc.gym.executors._question import OneQuestion
 from cloudrc.gym.executors.time_indexed import TimeIndexed
-from cloudrc.outside.values import Quantity
 
 STEPS = Quantity(ge=1, le=10_000, whole=True)
 """Number of steps."""

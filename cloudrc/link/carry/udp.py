@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from time import monotonic_ns, time_ns
 
-from cloudrc.files import at_place
+from cloudrc.base.files import at_place
 from cloudrc.link.carry.engine import BATCH, Engine, LinkWay, Packet
 from cloudrc.link.carry.log import PacketLog, ReleaseErrors
 from cloudrc.link.model import LinkDirection

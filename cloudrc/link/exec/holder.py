@@ -18,7 +18,7 @@ import sys
 import time
 from typing import Any
 
-from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.base.errors import MissingPrerequisiteError
 from cloudrc.link.exec import namespace
 from cloudrc.link.exec.listening import dropped_packets, listening_at
 

@@ -18,7 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.base.errors import MissingPrerequisiteError
 
 MTU = 1500  # longest IP packet on the link [bytes]
 DEVICE = "cloudrc"

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from math import inf, isnan
 from typing import Any, NamedTuple
 
+from cloudrc.base.outside.prometheus import Metrics, total
 from cloudrc.link.verify.judge import Judgement
-from cloudrc.outside.prometheus import Metrics, total
 
 LATE, UNREAD, STOPPED = 1.5e-3, 0.003, 0.01
 """Limits of a shaper with enough CPU time: 99 % quantile of its release error [s]; share of

@@ -30,7 +30,7 @@ from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.profile import DirectionProfile, Timeline
 from cloudrc.link.streams import Stream
 from cloudrc.link.verify.judge import Flow, Measurement
-from cloudrc.tunnel.codec import Direction, encode_header, peek
+from cloudrc.wire.tunnel.codec import Direction, encode_header, peek
 
 PROBE = 254  # kind of datagram in the header of probes; world and cloud reject this kind
 FIRST_PROBE = 1.0  # time from the start of the link to the first probe [s]

@@ -22,7 +22,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cloudrc.files import make_own_folder, who_may_write
+from cloudrc.base.files import make_own_folder, who_may_write
 
 SWITCH = "CLOUDRC_NATIVE"
 """Environment variable: with the value 0, all steps and predictions run in Python."""

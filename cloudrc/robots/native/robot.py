@@ -23,16 +23,21 @@ import numpy as np
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import find_robot
 from cloudrc.config.shipped import file_of
-from cloudrc.geometry.fence import FLOOR_MARGIN
-from cloudrc.geometry.obstacles import fence_of
-from cloudrc.geometry.scene import load_scene
-from cloudrc.messages import NEVER_NS, ZERO, Command, GuardState, Vector
+from cloudrc.physics.geometry.fence import FLOOR_MARGIN
+from cloudrc.physics.geometry.obstacles import fence_of
+from cloudrc.physics.geometry.scene import load_scene
+from cloudrc.physics.sim.memory import (
+    boxes_around,
+    contacts_offset,
+    mujoco_library,
+    without_contacts,
+)
+from cloudrc.physics.sim.onboard import Accelerator, Actuators, Onboard
+from cloudrc.physics.sim.readings import Readings
+from cloudrc.physics.sim.scene import compile_model
+from cloudrc.physics.sim.simulator import CONTACT_CHECK_STEPS, Simulator
 from cloudrc.robots.native.library import Library, library
-from cloudrc.sim.memory import boxes_around, contacts_offset, mujoco_library, without_contacts
-from cloudrc.sim.onboard import Accelerator, Actuators, Onboard
-from cloudrc.sim.readings import Readings
-from cloudrc.sim.scene import compile_model
-from cloudrc.sim.simulator import CONTACT_CHECK_STEPS, Simulator
+from cloudrc.wire.messages import NEVER_NS, ZERO, Command, GuardState, Vector
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard import state
 from cloudrc.world.guard.state import Guard

@@ -13,9 +13,9 @@ from math import inf
 
 import numpy as np
 
-from cloudrc.sim.airframe import Airframe, span
-from cloudrc.sim.onboard import Commands
-from cloudrc.sim.plant import Array
+from cloudrc.physics.sim.airframe import Airframe, span
+from cloudrc.physics.sim.onboard import Commands
+from cloudrc.physics.sim.plant import Array
 
 TINY = 1e-9
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.sim.airframe import read_thrusters
-from cloudrc.sim.onboard import Commands, Direct, Inputs
-from cloudrc.sim.readings import Readings
+from cloudrc.physics.sim.airframe import read_thrusters
+from cloudrc.physics.sim.onboard import Commands, Direct, Inputs
+from cloudrc.physics.sim.readings import Readings
 
 
 class RotorDrag(Direct):

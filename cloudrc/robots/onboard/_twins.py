@@ -8,9 +8,9 @@ import ctypes
 from math import inf
 from typing import TYPE_CHECKING
 
+from cloudrc.physics.sim.simulator import Simulator
 from cloudrc.robots.native.robot import ACTUATORS_MAX, Twin
 from cloudrc.robots.onboard._drag import RotorDrag
-from cloudrc.sim.simulator import Simulator
 
 if TYPE_CHECKING:
     from cloudrc.robots.onboard.diff_drive import DiffDrive

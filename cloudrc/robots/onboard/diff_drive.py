@@ -15,10 +15,10 @@ from math import atan2, hypot
 from typing import Any
 
 from cloudrc.config.schema import Positive
-from cloudrc.messages import Vector
-from cloudrc.sim.onboard import Accelerator, Commands, Direct
-from cloudrc.sim.readings import Readings
-from cloudrc.sim.wheels import Wheel, read_wheels
+from cloudrc.physics.sim.onboard import Accelerator, Commands, Direct
+from cloudrc.physics.sim.readings import Readings
+from cloudrc.physics.sim.wheels import Wheel, read_wheels
+from cloudrc.wire.messages import Vector
 
 SLOW = 0.1
 """Below this wanted speed the robot turns towards it more slowly, in proportion, because the

@@ -13,12 +13,12 @@ from math import atan2, hypot, pi, radians, remainder, sqrt, tan
 from typing import Any
 
 from cloudrc.config.schema import NotNegative, Tilt
-from cloudrc.messages import ZERO, Vector
+from cloudrc.physics.sim.airframe import Airframe, read_airframe
+from cloudrc.physics.sim.onboard import Accelerator, Actuators, Commands, Direct
+from cloudrc.physics.sim.readings import Readings
 from cloudrc.robots.onboard._allocation import Allocation
 from cloudrc.robots.onboard._drag import RotorDrag
-from cloudrc.sim.airframe import Airframe, read_airframe
-from cloudrc.sim.onboard import Accelerator, Actuators, Commands, Direct
-from cloudrc.sim.readings import Readings
+from cloudrc.wire.messages import ZERO, Vector
 
 VELOCITY_RADPS, ATTITUDE_RADPS, YAW_RADPS = 5.0, 20.0, 4.0
 """Largest default bandwidths of velocity, attitude and yaw [rad/s]."""

@@ -16,7 +16,8 @@ from __future__ import annotations
 from math import sqrt
 from typing import TypeAlias
 
-from cloudrc.messages import ZERO, Vector
+from cloudrc.physics.sim.onboard import Commands
+from cloudrc.physics.sim.readings import Readings
 from cloudrc.robots.pelican.rotors import (
     ARM,
     SPEED_MAX,
@@ -25,8 +26,7 @@ from cloudrc.robots.pelican.rotors import (
     TORQUE_RATIO,
     RotorSpeeds,
 )
-from cloudrc.sim.onboard import Commands
-from cloudrc.sim.readings import Readings
+from cloudrc.wire.messages import ZERO, Vector
 
 MASS = 1.05
 """Mass that the controller assumes [kg]. Source: docs/reference/plant.md, "Total mass"."""

@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cloud.motion import Body
 from cloudrc.config.schema import NotNegative, NotNegatives, Positive
-from cloudrc.geometry.vectors import step_towards
-from cloudrc.messages import ZERO, Odometry, Vector
+from cloudrc.physics.geometry.vectors import step_towards
 from cloudrc.robots.native.library import Library, library
 from cloudrc.robots.pelican.low_level import (
     GAIN_D,
@@ -39,6 +38,7 @@ from cloudrc.robots.pelican.low_level import (
     TILT_RATE_GAIN,
 )
 from cloudrc.robots.pelican.rotors import TIME_CONSTANT_DOWN, TIME_CONSTANT_UP
+from cloudrc.wire.messages import ZERO, Odometry, Vector
 from cloudrc.world.guard.limits import LOW_HEIGHT, LOW_SPEED, SINK_LEAD_MAX
 
 if TYPE_CHECKING:

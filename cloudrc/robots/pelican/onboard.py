@@ -14,7 +14,7 @@ from statistics import fmean
 from typing import Any
 
 from cloudrc.config.schema import NotNegative, NotNegatives, World
-from cloudrc.messages import Vector
+from cloudrc.physics.sim.onboard import Accelerator
 from cloudrc.robots.pelican.low_level import (
     GAIN_D,
     GAIN_I,
@@ -28,7 +28,7 @@ from cloudrc.robots.pelican.low_level import (
     LowLevel,
 )
 from cloudrc.robots.pelican.rotors import STOPPED, Rotors
-from cloudrc.sim.onboard import Accelerator
+from cloudrc.wire.messages import Vector
 
 MASS_SLACK = 0.1
 """Largest difference of the mass [kg]: the velocity loop compensates for a weight of 1 N."""

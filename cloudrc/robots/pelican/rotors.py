@@ -12,8 +12,8 @@ from __future__ import annotations
 from math import exp
 from typing import TypeAlias
 
-from cloudrc.sim.onboard import Commands
-from cloudrc.sim.readings import Readings
+from cloudrc.physics.sim.onboard import Commands
+from cloudrc.physics.sim.readings import Readings
 
 THRUST_COEFFICIENT = 9.9865e-6
 """kf: thrust per speed squared [N s^2]."""

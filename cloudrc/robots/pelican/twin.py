@@ -8,10 +8,10 @@ import ctypes
 from struct import Struct
 from typing import Any
 
+from cloudrc.physics.sim.simulator import Simulator
 from cloudrc.robots.native.robot import Twin
 from cloudrc.robots.pelican import low_level, rotors
 from cloudrc.robots.pelican.low_level import LowLevel
-from cloudrc.sim.simulator import Simulator
 
 _CONSTANTS = {
     rotors: "thrust_coefficient torque_ratio drag_coefficient arm height",

@@ -13,10 +13,10 @@ from __future__ import annotations
 from math import hypot, inf, nan
 from operator import le
 
-from cloudrc.geometry.fence import TAKE_OFF_MARGIN, Fence
-from cloudrc.geometry.vectors import step_towards
-from cloudrc.messages import ZERO, Cause, Vector
-from cloudrc.sim.readings import Readings
+from cloudrc.physics.geometry.fence import TAKE_OFF_MARGIN, Fence
+from cloudrc.physics.geometry.vectors import step_towards
+from cloudrc.physics.sim.readings import Readings
+from cloudrc.wire.messages import ZERO, Cause, Vector
 from cloudrc.world.guard.limits import clamp, limit_length
 
 BRAKE_MAX, BRAKE_MIN, BRAKE = 5.5, 1.0, 3.0

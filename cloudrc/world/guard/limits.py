@@ -14,8 +14,8 @@ from collections.abc import Iterable
 from math import copysign, inf, sqrt
 
 from cloudrc.config.profile import COMMAND_AGE_MS
-from cloudrc.geometry.fence import FLOOR_MARGIN
-from cloudrc.messages import ZERO, Vector
+from cloudrc.physics.geometry.fence import FLOOR_MARGIN
+from cloudrc.wire.messages import ZERO, Vector
 
 REACTION = 0.2
 """Time from the start of braking until the robot decelerates as its robot.yaml promises [s].

@@ -49,9 +49,10 @@ from math import inf
 
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits
-from cloudrc.geometry.fence import Fence
-from cloudrc.geometry.vectors import step_towards
-from cloudrc.messages import (
+from cloudrc.physics.geometry.fence import Fence
+from cloudrc.physics.geometry.vectors import step_towards
+from cloudrc.physics.sim.readings import Readings
+from cloudrc.wire.messages import (
     NEVER_NS,
     PLAN_STEP_NS,
     ZERO,
@@ -60,8 +61,7 @@ from cloudrc.messages import (
     GuardState,
     Vector,
 )
-from cloudrc.records import GuardChange
-from cloudrc.sim.readings import Readings
+from cloudrc.wire.records import GuardChange
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.hold import Descent, Halt, PositionHold, TakeOff
 from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX

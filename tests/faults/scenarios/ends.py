@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc import assembly
 from cloudrc.config.load import read_experiment
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import MissionConfig
-from cloudrc.geometry.obstacles import fence_of
-from cloudrc.geometry.scene import Tube
-from cloudrc.messages import Command, GuardState, Vector
-from cloudrc.records import CommandApplied, Control, Fault, GroundTruth
-from cloudrc.tunnel.handshake import BUSY_TEXT
+from cloudrc.flight import assembly
+from cloudrc.physics.geometry.obstacles import fence_of
+from cloudrc.physics.geometry.scene import Tube
+from cloudrc.wire.messages import Command, GuardState, Vector
+from cloudrc.wire.records import CommandApplied, Control, Fault, GroundTruth
+from cloudrc.wire.tunnel.handshake import BUSY_TEXT
 from tests.faults.adversary import Lie
 from tests.faults.measures import (
     AGE_MAX,

@@ -7,8 +7,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from itertools import islice
 
-from cloudrc.records import GroundTruth
-from cloudrc.tunnel import codec
+from cloudrc.wire.records import GroundTruth
+from cloudrc.wire.tunnel import codec
 from tests.faults.flight import FaultRun
 from tests.faults.inject import flipped
 from tests.faults.measures import Outcome, epochs, scenario, told

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 from math import isnan, nan
 
-from cloudrc.messages import Cause, GuardState
-from cloudrc.records import Arrival, Control, GroundTruth
+from cloudrc.wire.messages import Cause, GuardState
+from cloudrc.wire.records import Arrival, Control, GroundTruth
 from tests.faults.flight import FaultRun
 from tests.faults.measures import (
     Outcome,

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.drivers.realtime import free_ports
+from cloudrc.flight.drivers.realtime import free_ports
 
 pytestmark = pytest.mark.process
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.base.errors import MissingPrerequisiteError
 from cloudrc.link.carry import engine as module
 from cloudrc.link.carry import tun
 from cloudrc.link.carry.engine import Engine, LinkWay

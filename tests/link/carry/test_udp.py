@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 
 from cloudrc.config.shipped import names
-from cloudrc.drivers.realtime import free_ports
-from cloudrc.exposition.table import LINK_OUTCOMES
+from cloudrc.flight.drivers.realtime import free_ports
+from cloudrc.flight.runs.links.under_test import WAYS, measure, run_link
+from cloudrc.flight.runs.links.verify import find_experiment
 from cloudrc.link.carry import udp as module
 from cloudrc.link.carry.udp import Relay, ask_for_stamps
 from cloudrc.link.model import LinkDirection
@@ -25,9 +26,8 @@ from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE
 from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.judge import Flow, Measurement
 from cloudrc.link.verify.probe import FIRST_PROBE, PROBE, ProbeEnd
-from cloudrc.runs.links.under_test import WAYS, measure, run_link
-from cloudrc.runs.links.verify import find_experiment
-from cloudrc.tunnel.codec import SIZES
+from cloudrc.results.exposition.table import LINK_OUTCOMES
+from cloudrc.wire.tunnel.codec import SIZES
 from tests.conftest import wait_until
 from tests.link.profiles import profile_of
 

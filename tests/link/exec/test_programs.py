@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cloudrc.base.errors import MissingPrerequisiteError
 from cloudrc.config.profile import load_profile
-from cloudrc.drivers.namespaces import ProgramEnd
-from cloudrc.drivers.realtime import free_ports
-from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.flight.drivers.namespaces import ProgramEnd
+from cloudrc.flight.drivers.realtime import free_ports
 from cloudrc.link.exec.namespace import identity
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile

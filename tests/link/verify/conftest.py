@@ -8,14 +8,14 @@ from functools import cache
 import numpy as np
 
 from cloudrc.config.profile import load_profile
-from cloudrc.drivers.link_monitor import LinkMonitor
+from cloudrc.flight.drivers.link_monitor import LinkMonitor
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.causes import Findings
 from cloudrc.link.verify.judge import Flow, netem_makes
 from cloudrc.link.verify.probe import PROBE, plan_probes
-from cloudrc.records import Arrival, Fault, LinkChecked
-from cloudrc.tunnel.codec import SIZES, Kind
+from cloudrc.wire.records import Arrival, Fault, LinkChecked
+from cloudrc.wire.tunnel.codec import SIZES, Kind
 from tests.link.profiles import in_bursts, profile_of
 
 

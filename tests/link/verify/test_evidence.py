@@ -2,8 +2,8 @@
 
 """Evidence is read from the state, metrics and qdiscs of a link container."""
 
+from cloudrc.base.outside.prometheus import read_metrics
 from cloudrc.link.verify.causes import ShaperFacts, read_evidence
-from cloudrc.outside.prometheus import read_metrics
 
 NETEM = {"kind": "netem", "handle": "7401:", "packets": 85, "drops": 15}
 METRICS = """

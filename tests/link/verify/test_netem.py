@@ -8,10 +8,16 @@ from contextlib import contextmanager
 
 import pytest
 
-from cloudrc.errors import CloudrcError, MissingPrerequisiteError
-from cloudrc.runs.links import under_test
-from cloudrc.runs.links.under_test import DEVICE, HOSTS, run_link
-from cloudrc.runs.links.verify import as_text, find_experiment, make_plans, make_report, probe_link
+from cloudrc.base.errors import CloudrcError, MissingPrerequisiteError
+from cloudrc.flight.runs.links import under_test
+from cloudrc.flight.runs.links.under_test import DEVICE, HOSTS, run_link
+from cloudrc.flight.runs.links.verify import (
+    as_text,
+    find_experiment,
+    make_plans,
+    make_report,
+    probe_link,
+)
 
 pytestmark = pytest.mark.netem
 ASKED = ("delay_ms=400", "jitter_ms=80")  # far above what an emulated machine adds

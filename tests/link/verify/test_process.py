@@ -8,12 +8,12 @@ import subprocess
 
 import pytest
 
-from cloudrc.errors import CloudrcError
+from cloudrc.base.errors import CloudrcError
+from cloudrc.flight.runs.links import under_test, verify
+from cloudrc.flight.runs.links.under_test import run_link
+from cloudrc.flight.runs.links.verify import find_experiment, make_plans, probe_link
 from cloudrc.link.verify import verdict_of
 from cloudrc.link.verify.causes import find_causes
-from cloudrc.runs.links import under_test, verify
-from cloudrc.runs.links.under_test import run_link
-from cloudrc.runs.links.verify import find_experiment, make_plans, probe_link
 
 # Far above what a machine adds that does other things, too.
 LINK = ["link.uplink.delay_ms=100", "link.uplink.jitter_ms=40", "link.downlink.delay_ms=80"]

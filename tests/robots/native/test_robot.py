@@ -12,10 +12,13 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.messages import Command, GuardState
+from cloudrc.flight import assembly
+from cloudrc.physics.sim.engine import mujoco
+from cloudrc.physics.sim.memory import without_contacts
+from cloudrc.physics.sim.onboard import Accelerator, Direct
+from cloudrc.physics.sim.simulator import Simulator
 from cloudrc.robots.native import robot as native
 from cloudrc.robots.native.library import SWITCH, library
 from cloudrc.robots.native.robot import NativeRobot
@@ -25,11 +28,8 @@ from cloudrc.robots.pelican import twin
 from cloudrc.robots.pelican.low_level import LowLevel
 from cloudrc.robots.pelican.onboard import accelerator
 from cloudrc.robots.pelican.twin import PelicanTwin
-from cloudrc.sim.engine import mujoco
-from cloudrc.sim.memory import without_contacts
-from cloudrc.sim.onboard import Accelerator, Direct
-from cloudrc.sim.simulator import Simulator
-from cloudrc.tunnel.end import Identity
+from cloudrc.wire.messages import Command, GuardState
+from cloudrc.wire.tunnel.end import Identity
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.robot import STEP, Robot
 from tests.conftest import nightly, nightly_rows

@@ -6,9 +6,9 @@ from math import acos, cos, degrees, hypot, pi, sin
 
 import numpy as np
 
+from cloudrc.physics.sim.engine import mujoco
+from cloudrc.physics.sim.readings import Readings
 from cloudrc.robots.onboard import multirotor
-from cloudrc.sim.engine import mujoco
-from cloudrc.sim.readings import Readings
 
 DT = 0.002
 X = ((1, -1, 1), (1, 1, -1), (-1, 1, 1), (-1, -1, -1))

@@ -5,8 +5,8 @@
 import numpy as np
 import pytest
 
+from cloudrc.physics.sim.airframe import read_airframe
 from cloudrc.robots.onboard import multirotor
-from cloudrc.sim.airframe import read_airframe
 from tests.robots.onboard.conftest import X, big, compiled, nano, robot, x_layout
 
 INERTIA = ".03 .025 .05"

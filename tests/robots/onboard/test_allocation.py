@@ -5,8 +5,8 @@
 import numpy as np
 import pytest
 
+from cloudrc.physics.sim.airframe import read_airframe
 from cloudrc.robots.onboard._allocation import Allocation
-from cloudrc.sim.airframe import read_airframe
 from tests.robots.onboard.conftest import SKEW, big, compiled, hexarotor, one_site
 
 GRAVITY = 9.81

@@ -6,8 +6,8 @@ from contextlib import nullcontext
 
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import BadInputError
 from cloudrc.robots.build import build_robot
 from cloudrc.robots.onboard._drag import RotorDrag
 from tests.robots.onboard.conftest import nano, robot, x_layout

@@ -7,16 +7,16 @@ from math import cos, radians, sin
 import numpy as np
 import pytest
 
+from cloudrc.base.errors import BadInputError
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of
-from cloudrc.errors import BadInputError
-from cloudrc.messages import UPRIGHT, ZERO
+from cloudrc.physics.sim.readings import Readings
 from cloudrc.robots.build import check_robot
 from cloudrc.robots.pelican.low_level import (
     LowLevel,
     attitude,
 )
-from cloudrc.sim.readings import Readings
+from cloudrc.wire.messages import UPRIGHT, ZERO
 
 WEIGHT = 10.3005  # 1.05 kg * 9.81 m/s^2
 

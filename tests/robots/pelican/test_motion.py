@@ -9,10 +9,10 @@ import pytest
 
 from cloudrc.cloud.controllers.pid import build as pid
 from cloudrc.cloud.motion import Body, pack_goal
-from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
 from cloudrc.robots.native.library import Library, library
 from cloudrc.robots.pelican import motion
-from cloudrc.tunnel.codec import as_planned
+from cloudrc.wire.messages import UPRIGHT, ZERO, Odometry, Setpoint
+from cloudrc.wire.tunnel.codec import as_planned
 
 pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
 STATE = "position", "velocity", "_axis", "_rate", "_torque", "_thrust", "_reference", "_integral"

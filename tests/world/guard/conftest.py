@@ -9,9 +9,9 @@ import pytest
 
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotLimits
-from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState
+from cloudrc.physics.sim.readings import Readings
 from cloudrc.robots.pelican.low_level import LowLevel
-from cloudrc.sim.readings import Readings
+from cloudrc.wire.messages import UPRIGHT, ZERO, Command, GuardState
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.robot import Robot
 from tests.fences import FENCE

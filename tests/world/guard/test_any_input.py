@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.messages import GuardState
+from cloudrc.wire.messages import GuardState
 from cloudrc.world.guard.limits import COMMAND_MAX, growth
 from tests.fences import FENCE
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, armed, command, sensed

@@ -7,8 +7,8 @@ from random import Random
 
 import pytest
 
-from cloudrc.geometry.fence import TAKE_OFF_MARGIN, Fence
-from cloudrc.messages import GuardState
+from cloudrc.physics.geometry.fence import TAKE_OFF_MARGIN, Fence
+from cloudrc.wire.messages import GuardState
 from cloudrc.world.guard.state import Guard
 from tests.conftest import nightly
 from tests.fences import FENCE

@@ -7,7 +7,7 @@ from math import hypot, nan
 import pytest
 
 from cloudrc.config.robot import DEFAULT_LIMITS
-from cloudrc.messages import ZERO
+from cloudrc.wire.messages import ZERO
 from cloudrc.world.guard import hold as rules
 from cloudrc.world.guard.hold import PositionHold, TakeOff, brake_start
 from tests.fences import FENCE

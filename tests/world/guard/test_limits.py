@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from cloudrc.config.resolved import Bounds, ResolvedGuard, speed_cap
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits
-from cloudrc.messages import ZERO, GuardState
+from cloudrc.wire.messages import ZERO, GuardState
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.hold import brake_start
 from tests.fences import FENCE

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.messages import GuardState
+from cloudrc.wire.messages import GuardState
 from cloudrc.world.guard.state import Guard
 from tests.fences import FENCE
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, command, sensed

@@ -7,7 +7,7 @@ from math import inf, nan, nextafter
 import pytest
 
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.messages import Cause, GuardState
+from cloudrc.wire.messages import Cause, GuardState
 from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX
 from tests.world.guard.conftest import MS, TICK, armed, command, run
 from tests.world.guard.test_state import told

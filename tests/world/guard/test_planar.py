@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.messages import ZERO, Cause, GuardState
+from cloudrc.wire.messages import ZERO, Cause, GuardState
 from tests.fences import FENCE
 from tests.world.guard.conftest import DT, LIMITS, MS, SECOND, armed, bring_down, command, feed, run
 

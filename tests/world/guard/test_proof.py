@@ -4,7 +4,7 @@
 
 import pytest
 
-from cloudrc.messages import Command
+from cloudrc.wire.messages import Command
 from cloudrc.world.guard import hold
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.limits import COMMAND_MAX

@@ -8,9 +8,9 @@ from math import cos, dist, inf, nan, nextafter, radians, sin
 import pytest
 
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.geometry.fence import FLOOR_MARGIN
-from cloudrc.messages import ZERO, Cause, GuardState
-from cloudrc.sim.readings import Readings
+from cloudrc.physics.geometry.fence import FLOOR_MARGIN
+from cloudrc.physics.sim.readings import Readings
+from cloudrc.wire.messages import ZERO, Cause, GuardState
 from cloudrc.world.guard.hold import LAND_SPEED, STILL_SPEED
 from cloudrc.world.guard.limits import COMMAND_MAX, ramp_ns
 from cloudrc.world.guard.state import Guard

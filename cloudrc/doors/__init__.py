@@ -1,0 +1,3 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""How people and programs get in: commands, Python, the browser, ROS 2."""
