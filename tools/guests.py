@@ -16,8 +16,9 @@ from cloudrc.base.outside.document import read_document
 from cloudrc.config import shipped
 from cloudrc.config.problems import validate
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.config.robot import RobotFiles, find_robot
-from cloudrc.config.schema import MissionConfig, World
+from cloudrc.config.robot import RobotFiles
+from cloudrc.config.schema import MissionConfig
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.robots.build import build_robot
 from cloudrc.robots.check import SCENE, read_facts
 from tools.markdown import table
@@ -73,9 +74,10 @@ def link(kind: str, name: str) -> str:
 
 
 def _robot(name: str) -> str:
-    robot, world = find_robot(name), World(robot=name, scene=SCENE)
+    world = ResolvedWorld(robot=name, scene=SCENE)
+    robot = world.files.robot
     model = build_robot(world, ResolvedGuard.model_validate({})).simulator.model
-    facts = read_facts(world, robot, model)
+    facts = read_facts(world, model)
     folder = f"../../cloudrc/robots/{name}"
     return "\n".join(
         [

@@ -28,7 +28,6 @@ from cloudrc.config.heading import without_held_yaws
 from cloudrc.config.load import load_link, read_experiment, robot_settings
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.config.resolved import ResolvedExperiment, dump
-from cloudrc.config.robot import known_robot
 from cloudrc.config.schema import MissionConfig
 from cloudrc.flight.runs.session import experiment_of
 from cloudrc.link.follow import PROFILE
@@ -110,8 +109,8 @@ def _experiment(
         config.write_text(write_yaml(tree), encoding="utf-8")
         found = read_experiment(config, robot_settings(robot), flown=True)
     # As teleop does with an order, which may have waypoints of two numbers.
-    mission = put_on_ground(found.mission, found.world)
-    mission = without_held_yaws(mission, known_robot(found.world.robot).heading)
+    mission = put_on_ground(found.mission, found.world.files)
+    mission = without_held_yaws(mission, found.robot.heading)
     return found.model_copy(update={"mission": mission})
 
 

@@ -73,7 +73,7 @@ def _check_size(name: str) -> None:
     """Check that a robot has a size, because the cloud pod has no MuJoCo to measure the model."""
     robot = find_robot(name)
     if robot.hull_m is None and robot.hull_points is None:
-        radius = float(hull_of(name).radii[0])
+        radius = float(hull_of(name, robot).radii[0])
         text = f"in a cluster a robot needs its size; add the line hull_m: {radius + 0.0005:.3f}"
         raise problem_at("world.robot", f"{Path(name) / ROBOT_FILE}: {text}")
 

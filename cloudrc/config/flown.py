@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from cloudrc.base.outside.refusal import reading
+from cloudrc.config.world import WorldFiles
 from cloudrc.physics.geometry.clearance import Spheres
 from cloudrc.physics.geometry.fence import Fence
 from cloudrc.physics.geometry.moving import Moving
@@ -29,6 +30,11 @@ class FlownWorld:
     scene: Scene
     hull: Spheres | None  # of the robot; None: not known
     planar: bool  # whether the robot stays on the ground
+
+    @staticmethod
+    def of(files: WorldFiles) -> FlownWorld:
+        """Return the numbers of a robot and its scene as their files are now."""
+        return FlownWorld(files.scene, files.known_hull, files.robot.planar)
 
     @property
     def steered(self) -> Fence:

@@ -7,23 +7,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from cloudrc.config.problems import ConfigProblem
-from cloudrc.config.robot import is_planar
-from cloudrc.config.scene import scene_of
-from cloudrc.config.schema import GROUND, MissionConfig, Waypoint, World
+from cloudrc.config.schema import GROUND, MissionConfig, Waypoint
+from cloudrc.config.world import WorldFiles
 from cloudrc.physics.geometry.scene import Scene
 
 SAME = 1e-6
 """Largest difference from the height of the spawn [m]."""
 
 
-def put_on_ground(mission: MissionConfig, world: World) -> MissionConfig:
+def put_on_ground(mission: MissionConfig, files: WorldFiles) -> MissionConfig:
     """Return a mission in which waypoints of two numbers have the height of the spawn.
 
     A mission of a robot that flies stays as it is.
     """
-    if not is_planar(world.robot):
+    if not files.robot.planar:
         return mission
-    placed, height = list[Waypoint](), scene_of(world).spawn[2]
+    placed, height = list[Waypoint](), files.scene.spawn[2]
     for waypoint in mission.waypoints:
         x, y, z = waypoint.position_m
         at = x, y, height if z == GROUND else z

@@ -9,11 +9,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from cloudrc.base import plugins
-from cloudrc.base.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.base.outside.refusal import naming
-from cloudrc.base.outside.reuse import reuse
 from cloudrc.base.outside.values import RESULT
-from cloudrc.config.robot import RobotFiles, known_robot
+from cloudrc.config.robot import RobotFiles
 from cloudrc.config.shipped import ROBOT_FILE
 from cloudrc.physics.geometry.clearance import Spheres, ball
 
@@ -21,44 +19,13 @@ TOLERANCE = 1e-3
 """Length by which geoms may reach out of the hull [m]: hull_m is rounded."""
 
 
-def hull_of(name: str) -> Spheres:
-    """Return the spheres that contain a robot, given as for `find_robot`.
+def hull_of(name: str, robot: RobotFiles) -> Spheres:
+    """Return the spheres that contain a robot; `name` is for the text of an error.
 
     Raises:
         BadInputError: If its model or its file of spheres is wrong.
         MissingPrerequisiteError: If it gives no hull_m, and MuJoCo is missing.
     """
-    return reuse(("hull", name), lambda: _read_hull(name, known_robot(name)))
-
-
-def known_hull(name: str) -> Spheres | None:
-    """Return the hull of a robot; None if its files cannot be read here."""
-    try:
-        return hull_of(name)
-    except (BadInputError, MissingPrerequisiteError):
-        return None
-
-
-def doubts(name: str) -> Iterator[str]:
-    """Say that the size of a robot, given as for `find_robot`, cannot be right.
-
-    Raises:
-        BadInputError: If the model does not compile.
-        MissingPrerequisiteError: If MuJoCo is missing.
-    """
-    from cloudrc.physics.sim.bodies import reach_of
-
-    robot = known_robot(name)
-    if robot.hull_m is None or robot.hull_points is not None:
-        return
-    with naming(f"robot {name}"):
-        reach = reach_of(robot.model)
-    if robot.hull_m < reach - TOLERANCE:
-        text = f"hull_m is {robot.hull_m:g}, but the geoms reach {reach:.3f} m from the base"
-        yield f"{name}/{ROBOT_FILE}: {text}"
-
-
-def _read_hull(name: str, robot: RobotFiles) -> Spheres:
     if robot.hull_points is not None:
         return _spheres(plugins.find("hull", robot.hull_points, look=False))
     if robot.hull_m is not None:
@@ -67,6 +34,24 @@ def _read_hull(name: str, robot: RobotFiles) -> Spheres:
 
     with naming(f"robot {name}"):
         return ball(reach_of(robot.model))
+
+
+def doubts(name: str, robot: RobotFiles) -> Iterator[str]:
+    """Say that the size of a robot, called `name`, cannot be right.
+
+    Raises:
+        BadInputError: If the model does not compile.
+        MissingPrerequisiteError: If MuJoCo is missing.
+    """
+    from cloudrc.physics.sim.bodies import reach_of
+
+    if robot.hull_m is None or robot.hull_points is not None:
+        return
+    with naming(f"robot {name}"):
+        reach = reach_of(robot.model)
+    if robot.hull_m < reach - TOLERANCE:
+        text = f"hull_m is {robot.hull_m:g}, but the geoms reach {reach:.3f} m from the base"
+        yield f"{name}/{ROBOT_FILE}: {text}"
 
 
 def _spheres(file: plugins.Found) -> Spheres:

@@ -54,6 +54,7 @@ from cloudrc.config.robot import DEFAULT_LIMITS, known_robot
 from cloudrc.config.robot import facts as facts_of
 from cloudrc.config.schema import Experiment, MissionConfig, World
 from cloudrc.config.sensors import of_other_codec, without_sensor
+from cloudrc.config.world import read_world
 from cloudrc.link.traces import read_trace
 
 _NO_BOUNDS = Bounds(DEFAULT_LIMITS.model_copy(update={"acceleration_max_mps2": inf}), inf)
@@ -102,12 +103,14 @@ def load_experiment(
         bounds = _NO_BOUNDS
     else:
         with problems.collect(found, ("world", "scene")):
-            bounds = bounds_of(draft.world, has_speed=guard.speed_max_mps is not None)
+            files = read_world(draft.world)
+            bounds = bounds_of(files, has_speed=guard.speed_max_mps is not None)
         with problems.collect(found, ("world", "tuning")):
-            facts = facts_of(draft.world, guard.acceleration_max_mps2, guard.speed_max_mps)
+            limits = guard.acceleration_max_mps2, guard.speed_max_mps
+            facts = facts_of(known_robot(draft.world.robot), draft.world, *limits)
         problems.raise_problems(document, found, name)
     if build and facts:
-        found += overrides.complete_plugins(document, draft, facts)
+        found += overrides.complete_plugins(document, draft, files.robot, facts)
     else:
         overrides.name_plugins(document, draft.cloud)
     experiment = problems.validate(document, ResolvedExperiment, name, found, context=bounds)
@@ -196,11 +199,11 @@ def _read_robots(path: Path) -> list[dict[str, Any]]:
 
 def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> ResolvedExperiment:
     """Check that the mission fits the scene and the robot, and complete it with what they give."""
-    mission = put_on_ground(experiment.mission, experiment.world)
+    mission = put_on_ground(experiment.mission, experiment.world.files)
     found = [*_without_effect(document, experiment)]
     found += [*without_sensor(experiment)] or _check_mission(mission, experiment)
     problems.raise_problems(document, found, name)
-    mission = without_held_yaws(mission, known_robot(experiment.world.robot).heading)
+    mission = without_held_yaws(mission, experiment.robot.heading)
     return experiment.model_copy(update={"mission": mission})
 
 
@@ -227,9 +230,9 @@ def _check_mission(mission: MissionConfig, experiment: ResolvedExperiment) -> li
     world, sees = experiment.world, experiment.cloud.perception is not None
 
     def check() -> list[ConfigProblem]:
-        if above := check_scene(world, mission.touched):
+        if above := check_scene(world.files, mission.touched):
             return above
-        wrong = check_mission(mission, world, straight=not sees)
+        wrong = check_mission(mission, world.files, straight=not sees)
         return [problem._replace(path=("mission", *problem.path)) for problem in wrong]
 
     key = "mission", mission.model_dump_json(), world.scene, world.fence_m, world.robot, sees
@@ -430,7 +433,7 @@ def _remove_derived(document: Document, name: str, *, new_profile: bool) -> None
     guard = draft.guard
     derived: dict[KeyPath, Any] = {("guard", "plan_max_s"): _plan_max(document)}
     with suppress(BadInputError):  # another robot or scene may follow
-        bounds = bounds_of(draft.world, has_speed=guard.speed_max_mps is not None)
+        bounds = bounds_of(read_world(draft.world), has_speed=guard.speed_max_mps is not None)
         derived["guard", "acceleration_max_mps2"] = bounds.robot.acceleration_max_mps2
         age_max = guard.command_age_max_ms or COMMAND_AGE_MAX_MS
         derived["guard", "speed_max_mps"] = speed_cap(age_max, guard.plan_max_s or 0.0, bounds)

@@ -20,12 +20,11 @@ from cloudrc.base.text import unknown_name_text
 from cloudrc.config.follow import Follow
 from cloudrc.config.ground import check_heights
 from cloudrc.config.heading import check_yaws
-from cloudrc.config.hull import hull_of
 from cloudrc.config.problems import ConfigProblem, collect
-from cloudrc.config.robot import RobotFiles, known_robot
-from cloudrc.config.scene import scene_of, steered_in
-from cloudrc.config.schema import MissionConfig, Steps, World
+from cloudrc.config.robot import RobotFiles
+from cloudrc.config.schema import MissionConfig, Steps
 from cloudrc.config.setpoints import read_setpoints
+from cloudrc.config.world import WorldFiles
 from cloudrc.physics.geometry.clearance import Array, Spheres
 from cloudrc.physics.geometry.fence import Fence
 from cloudrc.physics.geometry.obstacles import obstacles, surface
@@ -44,12 +43,12 @@ TOUCHING = 1e-3
 """Distance from an obstacle below which the robot touches it [m]; it covers rounding errors."""
 
 
-def check_scene(world: World, touch: str | None) -> list[ConfigProblem]:
+def check_scene(files: WorldFiles, touch: str | None) -> list[ConfigProblem]:
     """List the problems of a scene for a mission that has to touch the body `touch`.
 
     Their paths are those of the experiment.
     """
-    scene, robot, fence = scene_of(world), hull_of(world.robot), steered_in(world)
+    scene, robot, fence = files.scene, files.hull, files.fence
     spawn = np.array([scene.spawn])
     low, high = (*fence.inner_low[:2], fence.low[2]), fence.inner_high  # it stands on the ground
     spawn_at = _point(scene.spawn)
@@ -69,20 +68,20 @@ def check_scene(world: World, touch: str | None) -> list[ConfigProblem]:
 
 
 def check_mission(
-    mission: MissionConfig, world: World, *, straight: bool = True
+    mission: MissionConfig, files: WorldFiles, *, straight: bool = True
 ) -> list[ConfigProblem]:
     """List the problems of a mission for a robot in its scene, with paths inside the mission.
 
     Without `straight`, the robot finds its ways by itself, so that only waypoints are judged.
     """
-    scene, robot = scene_of(world), known_robot(world.robot)
+    scene, robot = files.scene, files.robot
     if problem := _check_parts(mission) or _check_touch(mission, scene):
         return [problem]
     problems = [*check_heights(mission, scene)] if robot.planar else []
     problems += islice(check_yaws(mission, robot.heading), _REPORTED)
     if problems:
         return problems
-    fence, hull = steered_in(world), hull_of(world.robot)
+    fence, hull = files.fence, files.hull
     if mission.follow is not None:
         return [*_check_follow(mission.follow, robot, scene, fence)]
     if mission.setpoints is not None:

@@ -36,7 +36,7 @@ from cloudrc.config import problems, shipped
 from cloudrc.config.choice import PlugIn
 from cloudrc.config.cloud import Cloud
 from cloudrc.config.problems import ConfigProblem, ProblemsError
-from cloudrc.config.robot import RobotFacts, known_robot, parameters
+from cloudrc.config.robot import RobotFacts, RobotFiles, known_robot, parameters
 from cloudrc.config.schema import Experiment, Steps, World
 from cloudrc.config.sensors import lacks_of
 from cloudrc.wire.messages import UPRIGHT, ZERO, Odometry
@@ -194,12 +194,11 @@ def _parameters_at(document: Document, path: KeyPath) -> dict[str, Any]:
     given = {key: document.get("world", key) for key in ("robot", "tuning")}
     world = World(**{key: value for key, value in given.items() if value is not None})
     robot = shipped.model_path("robot", world.robot, document.source(("world", "robot")).folder)
-    return onboard_values(world.model_copy(update={"robot": robot}))
+    return onboard_values(known_robot(robot), world.model_copy(update={"robot": robot}))
 
 
-def onboard_values(world: World) -> dict[str, Any]:
+def onboard_values(robot: RobotFiles, world: World) -> dict[str, Any]:
     """Return all parameters of the onboard controller with their values, including defaults."""
-    robot = known_robot(world.robot)
     return default_parameters("onboard", robot.onboard.name) | parameters(robot, world)
 
 
@@ -240,17 +239,18 @@ def name_plugins(document: Document, cloud: Cloud) -> dict[KeyPath, dict[str, An
 
 
 def complete_plugins(
-    document: Document, draft: Experiment, robot: RobotFacts
+    document: Document, draft: Experiment, robot: RobotFiles, facts: RobotFacts
 ) -> list[ConfigProblem]:
     """Do as `name_plugins`, check the parameters, add defaults, and build each plug-in as a test.
 
     Return the problems.
     """
     found: list[ConfigProblem] = []
+    lacks = lacks_of(draft, robot)
     for path, plugin in name_plugins(document, draft.cloud).items():
         name, given = plugin["name"], {key: plugin[key] for key in plugin if key != "name"}
         try:
-            values = _complete(document, path, name, given, draft, robot)
+            values = _complete(document, path, name, given, draft, facts, lacks)
             document.tree["cloud"][path[1]] |= values
         except ProblemsError as error:
             found += [each._replace(path=path + each.path) for each in error.problems]
@@ -266,6 +266,7 @@ def _complete(
     given: dict[str, Any],
     draft: Experiment,
     robot: RobotFacts,
+    lacks: dict[str, str],
 ) -> dict[str, Any]:
     """Check the parameters `given` to a plug-in, and add defaults, once for the points of a sweep.
 
@@ -276,7 +277,6 @@ def _complete(
     for parameter, field in parameter_model(kind, name).model_fields.items():
         if field.annotation == Path | None and isinstance(given.get(parameter), str):
             given[parameter] = str(document.source((*path, parameter)).absolute(given[parameter]))
-    lacks = lacks_of(draft)
     key = ("plug-in", kind, name, json.dumps(given), plans, *lacks.values(), repr(robot))
     return reuse(key, lambda: _try(kind, name, given, robot, lacks, plans=plans))
 

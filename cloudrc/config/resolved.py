@@ -22,8 +22,7 @@ from cloudrc.config.choice import PlugIn
 from cloudrc.config.cloud import Cloud
 from cloudrc.config.faults import OF_LINK, acting, refusal, with_faults
 from cloudrc.config.profile import DIRECTIONS, RANDOM, CloudTime, CommandAge, DirectionConfig
-from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, known_robot
-from cloudrc.config.scene import scene_of
+from cloudrc.config.robot import DEFAULT_LIMITS, RobotFacts, RobotFiles, RobotLimits, facts
 from cloudrc.config.schema import (
     SPEED_MPS,
     Acceleration,
@@ -32,9 +31,10 @@ from cloudrc.config.schema import (
     MissionConfig,
     PlanMax,
     Speed,
-    World,
 )
+from cloudrc.config.world import ResolvedWorld, WorldFiles
 from cloudrc.physics.geometry.obstacles import fence_of
+from cloudrc.physics.geometry.scene import Scene
 
 HORIZON_MAX_S = 1.0
 """Default of cloud.horizon_max_s [s]. Source: docs/reference/control.md, "Predictors"."""
@@ -88,7 +88,8 @@ class ResolvedGuard(GuardConfig):
         cls, given: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo
     ) -> float:
         age_max = info.data.get("command_age_max_ms", COMMAND_AGE_MAX_MS)
-        plan_max, bounds = info.data.get("plan_max_s", 0.0), info.context or bounds_of(World())
+        plan_max = info.data.get("plan_max_s", 0.0)
+        bounds = info.context or bounds_of(ResolvedWorld().files)
         cap = speed_cap(age_max, plan_max, bounds)
         speed_max: float = cap if given is None else check(given)
         if speed_max > cap + 1e-6:
@@ -133,8 +134,25 @@ class ResolvedExperiment(Experiment):
     """An experiment that contains its mission (not only the name), and a value for every key."""
 
     mission: MissionConfig
+    world: ResolvedWorld = ResolvedWorld()
     guard: ResolvedGuard
     cloud: ResolvedCloud
+
+    @property
+    def robot(self) -> RobotFiles:
+        """The robot that flies, as its files describe it."""
+        return self.world.files.robot
+
+    @property
+    def scene(self) -> Scene:
+        """Where it flies, with the fence of this experiment."""
+        return self.world.files.scene
+
+    @property
+    def robot_facts(self) -> RobotFacts:
+        """What cloud's plug-ins know of the robot."""
+        limits = self.guard.acceleration_max_mps2, self.guard.speed_max_mps
+        return facts(self.robot, self.world, *limits)
 
     @property
     def is_fleet(self) -> bool:
@@ -204,16 +222,16 @@ class ResolvedExperiment(Experiment):
         return link.model_dump(mode="json", include=keys, exclude_defaults=True)
 
 
-def bounds_of(world: World, *, has_speed: bool = False) -> Bounds:
+def bounds_of(files: WorldFiles, *, has_speed: bool = False) -> Bounds:
     """Return what robot and scene of an experiment tell about the limits of the guard.
 
     If the fence is not known without MuJoCo, it limits nothing, as long as the experiment
     `has_speed`: it gives guard.speed_max_mps.
     """
-    scene, room = scene_of(world), inf
+    scene, room = files.scene, inf
     if scene.own_fence or not has_speed:
         room = fence_of(scene).room(scene.spawn)
-    return Bounds(known_robot(world.robot).guard, room)
+    return Bounds(files.robot.guard, room)
 
 
 def dump(experiment: ResolvedExperiment) -> str:

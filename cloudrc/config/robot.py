@@ -245,11 +245,6 @@ def known_robot(name: str) -> RobotFiles:
     return reuse(("robot", name), lambda: find_robot(name))
 
 
-def is_planar(name: str) -> bool:
-    """Return whether a robot stays on the ground; raise a BadInputError as `find_robot` does."""
-    return known_robot(name).planar
-
-
 @dataclass(frozen=True)
 class RobotFacts:
     """What cloud knows of a robot: predictors and controllers get it as `robot` of `build`."""
@@ -263,7 +258,7 @@ class RobotFacts:
 
 
 def facts(
-    world: World, acceleration_max: float | None, speed_max: float | None = None
+    robot: RobotFiles, world: World, acceleration_max: float | None, speed_max: float | None = None
 ) -> RobotFacts:
     """Return what cloud knows of a robot.
 
@@ -272,8 +267,7 @@ def facts(
     Raises:
         BadInputError: If the robot has no such tuning.
     """
-    robot, motion = known_robot(world.robot), None
-    given = parameters(robot, world)
+    motion, given = None, parameters(robot, world)
     if robot.motion is not None:
         motion = PlugIn.model_validate({**given, "name": robot.motion})
     tuned = robot.tunings.get(world.tuning or "")

@@ -8,10 +8,7 @@ from importlib.util import find_spec
 
 from cloudrc.base.outside.refusal import naming
 from cloudrc.base.outside.reuse import reuse
-from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import World
-from cloudrc.physics.geometry.fence import Fence
-from cloudrc.physics.geometry.obstacles import fence_of
 from cloudrc.physics.geometry.scene import Scene, load_scene
 
 
@@ -37,8 +34,3 @@ def _read(world: World) -> Scene:
         from cloudrc.physics.sim.bodies import complete
 
         return complete(scene)
-
-
-def steered_in(world: World) -> Fence:
-    """Return the fence inside which an operator steers; for a planar robot, at its height only."""
-    return fence_of(scene_of(world), planar=is_planar(world.robot))

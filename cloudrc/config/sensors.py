@@ -10,7 +10,7 @@ from cloudrc.base.outside.document import Document
 from cloudrc.config.camera import OF_CODEC
 from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.robot import known_robot
+from cloudrc.config.robot import RobotFiles
 from cloudrc.config.schema import Experiment
 
 GIVE_SCANNER = "choose the rover, or give its robot.yaml the key scan"
@@ -18,10 +18,9 @@ GIVE_CAMERA = "choose x2, or give its robot.yaml the key camera"
 """What to do about a robot that lacks a sensor."""
 
 
-def lacks_of(draft: Experiment) -> dict[str, str]:
+def lacks_of(draft: Experiment, robot: RobotFiles) -> dict[str, str]:
     """Return sensor -> why a perception cannot take its data, and what to do; "" if it can."""
     name, camera, scan = draft.world.robot, "", ""
-    robot = known_robot(name)
     if robot.camera is None:
         camera = f"takes pictures, but {name} has no camera: {GIVE_CAMERA}"
     elif draft.camera is None:
@@ -55,8 +54,7 @@ def of_other_codec(document: Document, experiment: ResolvedExperiment) -> Iterat
 
 def without_sensor(experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
     """List the keys that ask a robot for a scanner or a camera which it has not."""
-    name = experiment.world.robot
-    robot = known_robot(name)
+    name, robot = experiment.world.robot, experiment.robot
     if experiment.world.scan and robot.scan is None:
         yield ConfigProblem(("world", "scan"), "true", f"{name} has no scanner: {GIVE_SCANNER}")
     if experiment.camera is not None and robot.camera is None:

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from cloudrc.base.errors import CloudrcError, InterruptedRunError, NothingFlownError
 from cloudrc.base.outside.refusal import check_names, naming
-from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.base.outside.values import Quantity, to_plain
 from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.flight.runs.experiment import advice_on, check_mode, load
@@ -166,12 +165,11 @@ def fly(
     check_names("mode", [mode], MODES)
     require(f"mode {mode}", MODES[mode])
     own = {} if seed is None else {"seed": seed}
-    with reuse_results():  # checks, warnings and flight look at the same files
-        resolved = load(str(experiment), [*_texts(settings or {}), *_texts(own)])
-        check_mode(resolved, mode)
-        _warn(resolved)
-        if mode == "virtual" and out is None:
-            return _result(fly_in_memory(resolved))
+    resolved = load(str(experiment), [*_texts(settings or {}), *_texts(own)])
+    check_mode(resolved, mode)
+    _warn(resolved)
+    if mode == "virtual" and out is None:
+        return _result(fly_in_memory(resolved))
     if mode != "cluster":
         return _fly_here(resolved, mode, out)
     from cloudrc.cluster.client import connect

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.config.robot import known_robot
 from cloudrc.config.time_line import find_ways
 from cloudrc.flight.assembly import build_compute_time
 from cloudrc.link.draws import BLOCK, OVERTAKES, impairments, stream_key
@@ -60,7 +59,7 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
         )
     ]
     measured_ns, grid_ns = (grid_ns[grid_ns < DURATION_NS] for grid_ns in grids_ns)
-    size = TELEMETRY_SIZES[len(known_robot(world.robot).sensors)]
+    size = TELEMETRY_SIZES[len(experiment.robot.sensors)]
     up = _cross(experiment, Kind.TELEMETRY, size, measured_ns, measured_ns, newest_wins)
     heard_ns = up.at_ns.min(initial=DURATION_NS)
     if cloud.answers == "arrival":

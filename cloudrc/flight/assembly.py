@@ -21,7 +21,6 @@ import numpy as np
 
 from cloudrc.base.errors import ControllerLostError
 from cloudrc.base.outside.code import apart
-from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.cloud.compute_time import ComputeTime, compute_time
 from cloudrc.cloud.controllers import Controller
 from cloudrc.cloud.controllers.remote import ControllerChannel, OutsideController
@@ -36,8 +35,6 @@ from cloudrc.config.faults import CLOUD_KILLED, CLOUD_PAUSED, WORLD_PAUSED, acti
 from cloudrc.config.mission_check import start_of
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.robot import RobotFacts, facts, is_planar, known_robot
-from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.config.time_line import find_ways
 from cloudrc.flight.drivers.channels import find_channel
@@ -78,7 +75,6 @@ VIRTUAL_RING = KeyRing(KeySet(Key(b"nothing is secret in one process")))
 """Keys of world and cloud in virtual time; with them both ends drop damaged datagrams."""
 
 
-@reuse_results()
 def assemble(
     experiment: ResolvedExperiment,
     make_loop: Callable[..., ControlLoop] = ControlLoop,
@@ -142,7 +138,7 @@ def start_mission(
     from cloudrc.flight.drivers.virtual import Clock
     from cloudrc.teleop.store import MissionRecord, Order
 
-    teleop = teleop_of(steered_in(experiment.world), experiment.faults, clock or Clock())
+    teleop = teleop_of(experiment.world.files.fence, experiment.faults, clock or Clock())
     order = Order(build_plan(experiment), touch=experiment.mission.touch)
     teleop.start(now_ns, MissionRecord("m1", order, ONLY_MISSION))
     return teleop
@@ -279,7 +275,7 @@ def build_cloud(
     cloud = experiment.cloud
     controller = build_controller(experiment)
     remote = controller if isinstance(controller, OutsideController) else None
-    if is_planar(experiment.world.robot):
+    if experiment.robot.planar:
         controller = Planar(controller, cloud.controller.name)
     loop = _build_loop(experiment, controller, make_loop)
     if remote is not None and channel is not None:
@@ -308,7 +304,7 @@ def _build_loop(
     news = None if delta is None else SendOnDelta(delta, beat)
     return make_loop(
         lambda: build_plugin("estimators", cloud.estimator),
-        build_plugin("predictors", cloud.predictor, robot=_facts_of(experiment)),
+        build_plugin("predictors", cloud.predictor, robot=experiment.robot_facts),
         controller,
         horizon_max=cloud.horizon_max_s,
         freeze_after=cloud.freeze_after_s + (beat if news else 0.0),
@@ -325,14 +321,14 @@ def _build_perceiver(
     cpu_clock: Callable[[], int] | None,
 ) -> Perceiver | None:
     """Build what steers by what the robot sees; None without a perception."""
-    cloud, scan = experiment.cloud, known_robot(experiment.world.robot).scan
+    cloud, scan = experiment.cloud, experiment.robot.scan
     if cloud.perception is None:
         return None
-    perception = build_plugin("perceptions", cloud.perception, robot=_facts_of(experiment))
+    perception = build_plugin("perceptions", cloud.perception, robot=experiment.robot_facts)
     draws = generator(experiment.seed, "perception time", experiment.stream)
     worker = make_worker(compute_time(cloud, cloud.perception_ms, draws, cpu_clock))
     angles = angles_of(scan.rays, scan.fov_deg) if scan else np.empty(0)
-    fence = steered_in(experiment.world)
+    fence = experiment.world.files.fence
     return Perceiver(perception, worker, fence, angles, partial(loop.note_failure, "perception"))
 
 
@@ -354,13 +350,8 @@ def build_compute_time(
 def build_controller(experiment: ResolvedExperiment) -> Controller:
     """Build the controller of an experiment."""
     choice = experiment.cloud.controller
-    controller: Controller = build_plugin("controllers", choice, robot=_facts_of(experiment))
+    controller: Controller = build_plugin("controllers", choice, robot=experiment.robot_facts)
     return controller
-
-
-def _facts_of(experiment: ResolvedExperiment) -> RobotFacts:
-    guard = experiment.guard
-    return facts(experiment.world, guard.acceleration_max_mps2, guard.speed_max_mps)
 
 
 def build_links(
@@ -416,11 +407,10 @@ def build_plan(
     """
     if mission is None:
         mission, time_limit = experiment.mission, experiment.criteria.time_limit_s
-    fence = steered_in(experiment.world)
+    fence = experiment.world.files.fence
     track = read_setpoints(Path(mission.setpoints), fence) if mission.setpoints else ()
     if (follow := mission.follow) is not None:
-        world = experiment.world
-        place = start_of(follow, scene_of(world), planar=is_planar(world.robot))
+        place = start_of(follow, experiment.scene, planar=experiment.robot.planar)
         track = (0.0, place), (follow.duration_s, place)
     if track:
         legs: tuple[Leg, ...] = (Leg(track[0][1], tolerance=inf, time_limit=inf),)

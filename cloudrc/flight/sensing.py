@@ -12,8 +12,6 @@ import numpy as np
 
 from cloudrc.cloud.receiving import FrameReceiver
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.robot import known_robot
-from cloudrc.config.scene import scene_of
 from cloudrc.wire.endpoint import Worker
 from cloudrc.wire.pictures import Image, as_png, describe_codec, make_decoder, make_encoder
 
@@ -28,7 +26,7 @@ def build_scanner(
     experiment: ResolvedExperiment, robot: Robot, errors: np.random.Generator
 ) -> Scanner | None:
     """Build the robot's scanner, if it works in the experiment; `errors` draws its noise."""
-    scan = known_robot(experiment.world.robot).scan
+    scan = experiment.robot.scan
     if not experiment.scans or scan is None:
         return None
     from cloudrc.physics.sim.scan import Scanner
@@ -46,7 +44,7 @@ def build_film(
     Raises:
         MissingPrerequisiteError: If this machine cannot render, or lacks the codec.
     """
-    codec, config = experiment.camera, known_robot(experiment.world.robot).camera
+    codec, config = experiment.camera, experiment.robot.camera
     if codec is None or config is None:
         return None
     from cloudrc.physics.sim.camera import Camera
@@ -68,8 +66,8 @@ def build_target(experiment: ResolvedExperiment, robot: Robot) -> MovingTarget |
 
     Of several, that of the mission moves, or the first one.
     """
-    follow, camera = experiment.mission.follow, known_robot(experiment.world.robot).camera
-    bodies = {each.name: each for each in scene_of(experiment.world).moving}
+    follow, camera = experiment.mission.follow, experiment.robot.camera
+    bodies = {each.name: each for each in experiment.scene.moving}
     if camera is None or not bodies:
         return None
     from cloudrc.physics.sim.target import MovingTarget
@@ -80,7 +78,7 @@ def build_target(experiment: ResolvedExperiment, robot: Robot) -> MovingTarget |
 
 def build_receiver(experiment: ResolvedExperiment) -> FrameReceiver | None:
     """Build what receives the pictures of the robot's camera; None if it does not work."""
-    codec, config = experiment.camera, known_robot(experiment.world.robot).camera
+    codec, config = experiment.camera, experiment.robot.camera
     if codec is None or config is None:
         return None
     name = codec.codec

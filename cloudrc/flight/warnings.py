@@ -12,12 +12,10 @@ from collections.abc import Iterator
 from itertools import pairwise
 from math import ceil, dist, inf
 
-from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.base.rounding import exceeds
 from cloudrc.config.profile import CLOUD_TIME_MAX, COMMAND_AGE_MS, DIRECTIONS
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.robot import known_robot
-from cloudrc.config.scene import has_mujoco, scene_of
+from cloudrc.config.scene import has_mujoco
 from cloudrc.flight.ages import DURATION_NS, simulate_ages
 from cloudrc.flight.assembly import build_plan
 from cloudrc.link.doubts import describe_heavy_loss, describe_low_rate
@@ -37,7 +35,6 @@ WITHOUT_MODEL = (
 """Predictors of cloudrc that know no model of the robot."""
 
 
-@reuse_results()  # several checks look at the file of the robot
 def advise(experiment: ResolvedExperiment) -> list[str]:
     """Return a warning for each group of settings with which the flight is pointless."""
     return list(_advise(experiment))
@@ -85,7 +82,7 @@ def _advise(experiment: ResolvedExperiment) -> Iterator[str]:
 def _low_rates(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield a warning for each direction whose bottleneck is slower than its packets need."""
     command = COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
-    robot = known_robot(experiment.world.robot)
+    robot = experiment.robot
     telemetry, scan = TELEMETRY_SIZES[len(robot.sensors)], robot.scan if experiment.scans else None
     needs = (
         ("uplink", "telemetry", telemetry, experiment.world.odometry_rate_hz),
@@ -146,7 +143,7 @@ def _slow(experiment: ResolvedExperiment, plan: Plan) -> Iterator[str]:
     if mission.waypoints:
         time = min(plan.time_limit, sum(leg.time_limit for leg in legs)) - dwell
         if mission.start == "spawn":
-            places.insert(0, (scene_of(experiment.world).spawn, 0.0))
+            places.insert(0, (experiment.scene.spawn, 0.0))
     way = sum(max(0.0, dist(a, b) - near - far) for (a, near), (b, far) in pairwise(places))
     if time > 0 and way > speeds[key] * time:
         yield (

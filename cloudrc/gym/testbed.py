@@ -23,7 +23,6 @@ from cloudrc.base.outside.values import RESULT
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config.problems import problem_at
-from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Link
 from cloudrc.flight.assembly import assemble, build_links, flight_limit
 from cloudrc.flight.drivers.virtual import VirtualRun
@@ -166,7 +165,7 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         )
         self.experiment = loaded.model_copy(update={"link": Link(profile="ideal"), "faults": ()})
         guard = self.experiment.guard
-        axes = PLANE if is_planar(self.experiment.world.robot) else SPACE
+        axes = PLANE if self.experiment.robot.planar else SPACE
         self._parts = (*axes, "yaw rate")
         most = np.array([guard.speed_max_mps] * len(axes) + [guard.yaw_rate_max_radps])
         self.action_space = spaces.Box(-most, most, dtype=np.float64)

@@ -12,23 +12,20 @@ from typing import Any
 from cloudrc.base import plugins
 from cloudrc.base.outside.document import KeyPath
 from cloudrc.base.outside.refusal import naming
-from cloudrc.base.outside.reuse import reuse
 from cloudrc.base.outside.values import RESULT
 from cloudrc.config.choice import PlugIn
 from cloudrc.config.disturbances import Plant
 from cloudrc.config.overrides import BRAKING, build_plugin, onboard_values
 from cloudrc.config.problems import ProblemsError, at_key, problem_at
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.config.robot import RobotFiles, known_robot, parameters
-from cloudrc.config.scene import scene_of, steered_in
-from cloudrc.config.schema import World
+from cloudrc.config.robot import RobotFiles, parameters
 from cloudrc.config.shipped import ROBOT_FILE, file_of
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.physics.sim.airframe import thrust_to_weight
 from cloudrc.physics.sim.energy import EnergyMeter, power_factors
 from cloudrc.physics.sim.onboard import Accelerator, Actuators, Direct, Onboard
 from cloudrc.physics.sim.plant import Wind
 from cloudrc.physics.sim.scene import (
-    compile_model,
     compile_true,
     find_camera,
     find_part,
@@ -49,7 +46,7 @@ THRUST_TO_WEIGHT_MIN = 1.5
 """Smallest ratio of the largest thrust to the weight [1]: a tilted robot still climbs."""
 
 
-def check_robot(world: World, *, turns: bool = False) -> None:
+def check_robot(world: ResolvedWorld, *, turns: bool = False) -> None:
     """Check that the robot compiles and can move as `world` says, and with `turns` obeys a yaw."""
     onboard = build_robot(world, ResolvedGuard.model_validate({})).onboard
     advise(world, ZERO)
@@ -58,13 +55,12 @@ def check_robot(world: World, *, turns: bool = False) -> None:
         raise problem_at("mission.waypoints", reason)
 
 
-def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:
+def build_robot(world: ResolvedWorld, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:
     """Compile the robot that flies or drives in a scene, and build it, guarded by `limits`."""
-    robot = known_robot(world.robot)
-    files = robot.model, file_of(world.scene)
+    robot = world.files.robot
     with naming(f"robot {world.robot}"):
         # A copy, because an onboard controller of a user gets it, and may change it.
-        nominal = copy(reuse(("model", *files), lambda: compile_model(*files)))
+        nominal = copy(world.files.compiled)
     with at_key("world.robot", f"{_file_of(world)}: onboard: "):
         # The build below uses the same import of the file.
         plugin = plugins.find(KIND, robot.onboard.name)
@@ -102,50 +98,50 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
 
 
 def _connect(
-    world: World,
+    world: ResolvedWorld,
     plugin: plugins.Found,
     simulator: Simulator,
     onboard: Onboard,
     limits: ResolvedGuard,
 ) -> Robot:
     """Make the robot of its parts, with what runs its usual steps faster, if there is any."""
-    files, faster = known_robot(world.robot), accelerator(world, plugin)
-    guard = Guard(limits, steered_in(world), files.guard)
+    robot_files, faster = world.files.robot, accelerator(world, plugin)
+    guard = Guard(limits, world.files.fence, robot_files.guard)
     make = Robot if faster is None else faster.make or Robot
     with plugin.calling("build" if make is Robot else "accelerator"):
         robot: Robot = make(simulator, onboard, guard)
     if not plugin.is_shipped:
-        robot.name = Path(files.onboard.name).name
+        robot.name = Path(robot_files.onboard.name).name
     return robot
 
 
-def advise(world: World, gains: Vector) -> tuple[str, ...]:
+def advise(world: ResolvedWorld, gains: Vector) -> tuple[str, ...]:
     """Return the warnings of the onboard controller about a world that differs from its model.
 
     Its plug-in may have a function `advise(world, values, gains)`; `values` are its parameters.
     `gains` are the cloud's velocities per distance from the setpoint [1/s], 0 if unknown.
     """
-    plugin = plugins.find(KIND, known_robot(world.robot).onboard.name)
+    plugin = plugins.find(KIND, world.files.robot.onboard.name)
     if plugin.get("advise") is None:
         return ()
-    values = onboard_values(world)
+    values = onboard_values(world.files.robot, world)
     with plugin.calling("advise") as function:
         return tuple(map(str, function(world, values, gains)))
 
 
-def accelerator(world: World, plugin: plugins.Found | None = None) -> Accelerator | None:
+def accelerator(world: ResolvedWorld, plugin: plugins.Found | None = None) -> Accelerator | None:
     """Return what can run the usual steps of a robot faster; None if nothing can.
 
     `plugin` is the file of its onboard controller, if it is loaded.
     """
-    plugin = plugin or plugins.find(KIND, known_robot(world.robot).onboard.name)
+    plugin = plugin or plugins.find(KIND, world.files.robot.onboard.name)
     if not world.is_nominal or plugin.get("accelerator") is None:
         return None
     with plugin.calling("accelerator") as function:
         return function()  # type: ignore[no-any-return]
 
 
-def describe_steps(world: World) -> str:
+def describe_steps(world: ResolvedWorld) -> str:
     """Say in which language the usual steps of a robot run on this machine."""
     faster = accelerator(world)
     if faster is None:
@@ -153,7 +149,7 @@ def describe_steps(world: World) -> str:
     return faster.text
 
 
-def _build_onboard(world: World, robot: RobotFiles, model: Any) -> Onboard:
+def _build_onboard(world: ResolvedWorld, robot: RobotFiles, model: Any) -> Onboard:
     """Build the onboard controller for a compiled `MjModel`."""
     name = robot.onboard.name
     choice = PlugIn.model_validate({**parameters(robot, world), "name": name})
@@ -166,25 +162,25 @@ def _build_onboard(world: World, robot: RobotFiles, model: Any) -> Onboard:
             raise _problem(world, first.path, f"{first._replace(path=())} ({name})") from error
 
 
-def _problem(world: World, path: KeyPath, reason: str) -> ProblemsError:
+def _problem(world: ResolvedWorld, path: KeyPath, reason: str) -> ProblemsError:
     """Return the error at the key that gives a parameter of the onboard controller.
 
     `path` is the parameter, and the keys inside its value.
     """
     if path[0] in (world.onboard.model_extra or {}):
         return problem_at(".".join(("world.onboard", *path)), reason)
-    tuning = known_robot(world.robot).tunings.get(world.tuning or "")
+    tuning = world.files.robot.tunings.get(world.tuning or "")
     where, key = ".".join(("onboard", *path)), "world.robot"
     if tuning and path[0] in (tuning.model_extra or {}):
         where, key = ".".join(("tunings", str(world.tuning), *path)), "world.tuning"
     return problem_at(key, f"{_file_of(world)}: {where}: {reason}")
 
 
-def _file_of(world: World) -> str:
+def _file_of(world: ResolvedWorld) -> str:
     return world.robot if world.robot.endswith(".xml") else f"{world.robot}/{ROBOT_FILE}"
 
 
-def _change(world: World, robot: RobotFiles, nominal: Any) -> Any:
+def _change(world: ResolvedWorld, robot: RobotFiles, nominal: Any) -> Any:
     """Return the model of the true robot, which may differ from the `nominal` one."""
     factors = world.plant.actuator_factor
     if world.plant == Plant():
@@ -199,13 +195,13 @@ def _change(world: World, robot: RobotFiles, nominal: Any) -> Any:
         return compile_true(robot.model, file_of(world.scene), nominal, world.plant)
 
 
-def _check_rest(world: World, model: Any, stopped: tuple[float, ...]) -> None:
+def _check_rest(world: ResolvedWorld, model: Any, stopped: tuple[float, ...]) -> None:
     """Check that a planar robot stands at the height of the spawn.
 
     Missions have this height, and the robot cannot change it. `model` is the compiled `MjModel`,
     `stopped` the commands of the robot at rest.
     """
-    base, spawn = rest_height(model, stopped, SETTLING), scene_of(world).spawn[2]
+    base, spawn = rest_height(model, stopped, SETTLING), world.files.scene.spawn[2]
     if abs(base - spawn) > REST_ERROR_MAX:
         raise problem_at(
             "world.robot",
@@ -215,7 +211,7 @@ def _check_rest(world: World, model: Any, stopped: tuple[float, ...]) -> None:
         )
 
 
-def _check_lift(world: World, model: Any) -> None:
+def _check_lift(world: ResolvedWorld, model: Any) -> None:
     """Check that the true robot, a compiled `MjModel`, can lift off safely."""
     ratio = thrust_to_weight(model)
     if ratio is not None and ratio < THRUST_TO_WEIGHT_MIN:

@@ -17,12 +17,12 @@ import numpy as np
 
 from cloudrc.base.outside.code import calling
 from cloudrc.base.text import table
-from cloudrc.config.hull import doubts, hull_of
+from cloudrc.config.hull import doubts
 from cloudrc.config.overrides import onboard_values
 from cloudrc.config.problems import ConfigProblem, collect
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.config.robot import RobotFiles, find_robot
-from cloudrc.config.schema import World
+from cloudrc.config.robot import RobotFiles
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.physics.geometry.vectors import step_towards
 from cloudrc.physics.sim.airframe import read_turns, thrust_to_weight
 from cloudrc.physics.sim.bodies import reach_of
@@ -60,13 +60,13 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
     Args:
         name: Name of a shipped robot, or absolute path of a folder or an .xml file.
     """
-    world = World.model_validate({"robot": name, "scene": SCENE})
-    robot = find_robot(name)
-    hull_of(name)
+    world = ResolvedWorld.model_validate({"robot": name, "scene": SCENE})
+    robot = world.files.robot
+    _ = world.files.hull  # it can be read
     advise(world, ZERO)
     body = build_robot(world, ResolvedGuard.model_validate({}))
-    facts = read_facts(world, robot, body.simulator.model)
-    changes, failures = [*doubts(name)], list[ConfigProblem]()
+    facts = read_facts(world, body.simulator.model)
+    changes, failures = [*doubts(name, robot)], list[ConfigProblem]()
     for tuning in robot.tunings:  # an experiment may choose it
         with collect(failures, ()):
             check_robot(world.model_copy(update={"tuning": tuning}))
@@ -82,8 +82,9 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
     return facts, [*changes, *_judge(robot, facts, rest)]
 
 
-def read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
+def read_facts(world: ResolvedWorld, model: Any) -> dict[str, Any]:
     """Return the facts that need no motion."""
+    robot = world.files.robot
     base = model.jnt_bodyid[0]
     ratio = thrust_to_weight(model) if not robot.planar else None
     turns = read_turns(model)
@@ -99,7 +100,7 @@ def read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
         "planar": robot.planar,
         "heading": robot.heading,
         "onboard": robot.onboard.name,
-        "parameters": onboard_values(world),
+        "parameters": onboard_values(robot, world),
         "guard": robot.guard.model_dump(),
         "size_m": size,
         "hull_m": robot.hull_m or size,

@@ -240,7 +240,7 @@ def present_value(experiment: ResolvedExperiment, key: str) -> int | float | Non
     names = key.replace("link.both.", "link.uplink.").split(".")
     value: Any = experiment.model_dump(mode="json")
     if names[:2] == ["world", "onboard"]:
-        value["world"]["onboard"] = onboard_values(experiment.world)
+        value["world"]["onboard"] = onboard_values(experiment.robot, experiment.world)
     for name in names:
         value = child(value, name)
     if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):

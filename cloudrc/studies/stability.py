@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from cloudrc.base.outside import code
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
 from cloudrc.flight import assembly
 from cloudrc.flight.ages import simulate_ages
@@ -99,7 +98,7 @@ def fly_step(experiment: ResolvedExperiment, size: float = SMALL) -> Answer:
 
 def _fly_step(experiment: ResolvedExperiment, size: float) -> Answer:
     window = window_of(experiment)
-    if is_planar(experiment.world.robot):
+    if experiment.robot.planar:
         start, step = np.array(load_scene(SCENE).spawn), np.array((size, size, 0.0))
     else:
         start, step = np.array((0.0, 0.0, END_HEIGHT - size)), np.full(3, size)

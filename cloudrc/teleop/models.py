@@ -21,7 +21,6 @@ from cloudrc.config.ground import put_on_ground
 from cloudrc.config.heading import WHY, without_held_yaws
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import ConfigProblem, from_pydantic
-from cloudrc.config.robot import RobotFiles, known_robot
 from cloudrc.config.schema import (
     MAX_WAYPOINTS,
     Carrot,
@@ -32,10 +31,10 @@ from cloudrc.config.schema import (
     TimeLimit,
     Touch,
     Waypoint,
-    World,
     Yaw,
 )
 from cloudrc.config.section import Described, Section
+from cloudrc.config.world import WorldFiles
 from cloudrc.results.metrics.verdict import FailureCode, Outcome
 from cloudrc.teleop.store import SHOWN, Order
 from cloudrc.teleop.wire import EventName, Leg, Plan
@@ -321,12 +320,12 @@ class RequestReader:
     """Reads and checks the bodies of requests; raises a RefusedError that lists all problems.
 
     Attributes:
-        world: Robot and scene.
+        files: Robot and scene.
         plan: Makes a plan from a mission and a time limit [s], which may be None.
         touch: What the experiment's mission has to touch: a point there is no problem.
     """
 
-    world: World
+    files: WorldFiles
     plan: Callable[[MissionConfig, float | None], Plan]
     touch: Touch | None = None
 
@@ -336,10 +335,11 @@ class RequestReader:
         if not (request.waypoints or request.follow):  # only an experiment may have steps instead
             raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
         mission = MissionConfig(**{name: getattr(request, name) for name in ORDERED})
-        mission = put_on_ground(mission, self.world)
-        if problems := check_mission(mission, self.world):
+        mission = put_on_ground(mission, self.files)
+        if problems := check_mission(mission, self.files):
             raise RefusedError(problems)
-        planned = self.plan(without_held_yaws(mission, self._robot.heading), request.time_limit_s)
+        mission = without_held_yaws(mission, self.files.robot.heading)
+        planned = self.plan(mission, request.time_limit_s)
         lease = request.lease_s or 0.0
         return Order(planned, request.name, request.key, request.touch, request.queue, lease)
 
@@ -347,15 +347,15 @@ class RequestReader:
         """Read a point."""
         request = _parse(body, GoToRequest)
         # A robot that turns towards its velocity turns on the spot once it is there.
-        on_the_spot = request.yaw_deg if self._robot.heading == "velocity" else None
+        on_the_spot = request.yaw_deg if self.files.robot.heading == "velocity" else None
         yaw_deg = request.yaw_deg if on_the_spot is None else None
         waypoint = Waypoint(position_m=request.position_m, yaw_deg=yaw_deg)
         # What is an obstacle depends on the mission under way; the service checks the way there.
         mission = MissionConfig(start="here", waypoints=(waypoint,), touch=self.touch)
-        mission = put_on_ground(mission, self.world)
-        if problems := check_mission(mission, self.world):
+        mission = put_on_ground(mission, self.files)
+        if problems := check_mission(mission, self.files):
             raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
-        (waypoint,) = without_held_yaws(mission, self._robot.heading).waypoints
+        (waypoint,) = without_held_yaws(mission, self.files.robot.heading).waypoints
         yaw_deg = waypoint.yaw_deg if on_the_spot is None else on_the_spot
         return Leg(waypoint.position_m, None if yaw_deg is None else radians(yaw_deg))
 
@@ -363,17 +363,13 @@ class RequestReader:
         """Read a velocity [m/s] and a yaw rate [rad/s]."""
         request = _parse(body, DriveRequest)
         velocity, yaw_rate = request.velocity_mps, request.yaw_rate_radps
-        if yaw_rate and self._robot.heading == "fixed":
+        if yaw_rate and self.files.robot.heading == "fixed":
             reason = f"{WHY['fixed']}; leave it out, or choose another robot, such as x2"
             raise RefusedError([ConfigProblem(("yaw_rate_radps",), f"{yaw_rate:g}", reason)])
-        if self._robot.planar and velocity[2] != 0.0:
+        if self.files.robot.planar and velocity[2] != 0.0:
             reason = "leads up or down, but this robot stays on the ground; set it to 0"
             raise RefusedError([ConfigProblem(("velocity_mps", "2"), f"{velocity[2]:g}", reason)])
         return velocity, yaw_rate
-
-    @property
-    def _robot(self) -> RobotFiles:
-        return known_robot(self.world.robot)
 
 
 def as_json(problem: ConfigProblem) -> dict[str, str | int | None]:

@@ -18,11 +18,10 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.perceptions import Frame, Perception, Scan
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.config.overrides import OUTSIDE
-from cloudrc.config.robot import facts
-from cloudrc.config.schema import World
 from cloudrc.wire.messages import UPRIGHT, ZERO, Command, Odometry, Setpoint
+from tests.support.robots import facts_of
 
-PELICAN, X2 = facts(World(), 12.0), facts(World(robot="x2"), 4.0)
+PELICAN, X2 = facts_of("pelican", 12.0), facts_of("x2", 4.0)
 KINDS = {
     estimators: Estimator,
     predictors: Predictor,

@@ -10,12 +10,11 @@ import pytest
 
 from cloudrc.cloud.predictors import command_history, kalman, model_based
 from cloudrc.cloud.predictors._history import Replay
-from cloudrc.config.robot import facts
-from cloudrc.config.schema import World
 from cloudrc.wire.messages import UPRIGHT, ZERO, Command, Odometry
 from tests.cloud.conftest import MS, planned
+from tests.support.robots import facts_of
 
-PELICAN = facts(World(), 12.0)
+PELICAN = facts_of("pelican", 12.0)
 AHEAD = 1234 * MS  # cloud's clock minus world's clock [ns]
 
 

@@ -10,11 +10,10 @@ import pytest
 
 from cloudrc.cloud.perceptions import Frame
 from cloudrc.cloud.perceptions.target import build
-from cloudrc.config.robot import facts
-from cloudrc.config.schema import World
 from cloudrc.wire.messages import ZERO, Odometry
+from tests.support.robots import facts_of
 
-X2 = facts(World(robot="x2"), 4.0)
+X2 = facts_of("x2", 4.0)
 WIDTH, HEIGHT, FOVY = 320, 240, radians(60)
 FOCAL = HEIGHT / 2 / tan(FOVY / 2)
 RED, SHADE, GREY, ORANGE = (230, 26, 20), (115, 13, 10), (120, 125, 140), (230, 130, 20)

@@ -74,7 +74,7 @@ def test_a_silent_link_makes_the_rover_hold_and_then_stop_for_good():
 
 def test_teleop_takes_two_numbers_and_refuses_heights():
     experiment = load_experiment("pillars")
-    read = RequestReader(experiment.world, partial(build_plan, experiment))
+    read = RequestReader(experiment.world.files, partial(build_plan, experiment))
     taken = read.order(b'{"waypoints": [{"position_m": [1.5, 1.2]}]}')
     assert taken.plan.legs[0].position == (1.5, 1.2, 0.1)
     with pytest.raises(RefusedError, match="has a height"):

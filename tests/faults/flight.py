@@ -18,8 +18,7 @@ from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
 from cloudrc.config import shipped
 from cloudrc.config.load import load_experiment
-from cloudrc.config.robot import is_planar
-from cloudrc.config.scene import steered_in
+from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import World
 from cloudrc.flight import assembly
 from cloudrc.flight.drivers.teleop import PERIOD_NS as WAKE_NS
@@ -78,7 +77,7 @@ class FaultRun:
         self._clock = Clock(round(offset * 1e9), schedule.cloud_drift)
         is_shared = self._clock == Clock()
         self._clock_id = assembly.VIRTUAL_CLOCK if is_shared else assembly.CLOUD_CLOCK
-        self._fence = steered_in(self.experiment.world)
+        self._fence = self.experiment.world.files.fence
         policy, self._words = dishonesty(schedule, self._fence)
         mistakes = [bugs(schedule, self._clock)] if schedule.of(*BUGS) else []
         self._lies = [*policy, *mistakes, *lies]
@@ -240,4 +239,4 @@ def _experiment_of(robot: str) -> str:
     """Return the name of the shipped experiment in which a robot meets faults."""
     if robot == World().robot:
         return "paper"
-    return "pillars" if is_planar(robot) else "steps"
+    return "pillars" if find_robot(robot).planar else "steps"

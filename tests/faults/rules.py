@@ -8,8 +8,6 @@ from math import inf
 from typing import NamedTuple
 
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.robot import find_robot
-from cloudrc.config.scene import scene_of
 from cloudrc.physics.geometry.obstacles import fence_of
 from cloudrc.wire.messages import GuardState
 
@@ -39,7 +37,7 @@ class Rules:
     """
 
     def __init__(self, experiment: ResolvedExperiment) -> None:
-        robot, fence = find_robot(experiment.world.robot), fence_of(scene_of(experiment.world))
+        robot, fence = experiment.robot, fence_of(experiment.scene)
         self.limits, self.touched = experiment.guard, experiment.mission.touched
         self.planar, self.braking = robot.planar, robot.guard.braking_mps2
         self.low, self.high = fence.low, fence.high

@@ -47,7 +47,7 @@ def test_the_board_moves_from_the_start_on_and_is_recorded_as_often_as_the_truth
 
 def test_an_operator_may_order_it_and_gets_its_report():
     experiment = load_experiment("follow", BLIND)
-    read = RequestReader(experiment.world, partial(build_plan, experiment))
+    read = RequestReader(experiment.world.files, partial(build_plan, experiment))
     order = read.order(b'{"follow": {"target": "board", "duration_s": 5, "height_m": 1}}')
     assert order.plan.track == ((0.0, (0.0, 0.0, 1.1)), (5.0, (0.0, 0.0, 1.1)))
     assert order.plan.contents == "following board for 5 s"

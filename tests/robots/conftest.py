@@ -8,7 +8,7 @@ import pytest
 
 from cloudrc.base.errors import BadInputError
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import World
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.robots.build import check_robot
 
 CONTROLLER = find_robot("pelican").onboard.name
@@ -16,7 +16,7 @@ HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene":
 
 
 def world(**keys):
-    return World.model_validate_json(json.dumps({"scene": "empty", **keys}))
+    return ResolvedWorld.model_validate_json(json.dumps({"scene": "empty", **keys}))
 
 
 def refused(**keys):

@@ -11,7 +11,7 @@ import cloudrc
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import World
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.robots.build import build_robot
 from tests.robots.conftest import refused
 
@@ -26,7 +26,7 @@ def drive(own_robot):
 
     def go(*wanted, model=TEXT, onboard="diff_drive", time=2.0):
         folder = own_robot(f"onboard: {onboard}\nplanar: true", model)
-        robot = build_robot(World(robot=str(folder), scene="empty"), ResolvedGuard())
+        robot = build_robot(ResolvedWorld(robot=str(folder), scene="empty"), ResolvedGuard())
         simulator, controller = robot.simulator, robot.onboard
         for *velocity, yaw_rate in wanted:
             for _ in range(round(time / simulator.dt)):
@@ -74,7 +74,7 @@ def test_at_rest_it_turns_with_the_yaw_rate_and_while_it_drives_the_velocity_dec
 
 
 def test_no_wheel_is_faster_than_its_limit_and_turning_comes_first():
-    robot = build_robot(World(robot="rover", scene="empty"), ResolvedGuard())
+    robot = build_robot(ResolvedWorld(robot="rover", scene="empty"), ResolvedGuard())
     controller, readings = robot.onboard, robot.simulator.readings
     assert controller.update(readings, (50.0, 0.0, 0.0), 0.0) == pytest.approx((20.0, 20.0))
     left, right = controller.update(readings, (50.0, 50.0, 0.0), 0.0)

@@ -11,8 +11,8 @@ from cloudrc.base.errors import BadInputError
 from cloudrc.cloud.results import is_ours
 from cloudrc.config.choice import PlugIn
 from cloudrc.config.overrides import build_plugin, onboard_values
-from cloudrc.config.robot import facts, known_robot
-from cloudrc.config.schema import World
+from cloudrc.config.robot import facts, find_robot
+from cloudrc.config.world import ResolvedWorld
 from tests.conftest import nightly
 
 GROUND = {"steps": {"count": 3, "centre_m": [0, 0, 0.1], "range_m": [1.5, 1.5, 0]}}
@@ -20,8 +20,9 @@ MODELS = ("command_history", "kalman", "model_based")
 
 
 def build(robot, predictor, **keys):
-    world = World.model_validate_json(json.dumps({"robot": robot, **keys}))
-    return build_plugin("predictors", PlugIn.model_validate(predictor), robot=facts(world, 7.0))
+    world = ResolvedWorld.model_validate_json(json.dumps({"robot": robot, **keys}))
+    known = facts(world.files.robot, world, 7.0)
+    return build_plugin("predictors", PlugIn.model_validate(predictor), robot=known)
 
 
 @pytest.mark.parametrize("robot", ["nano", *nightly("rover")])
@@ -64,7 +65,8 @@ def test_the_response_belongs_to_a_tuning(own_robot):
         for tuning in (None, "a", "b")
     }
     assert constants == {None: 2.0, "a": 3.0, "b": 2.0}
-    assert onboard_values(World(robot=str(mine), tuning="a"))["tilt_max_deg"] == 20
+    world = ResolvedWorld(robot=str(mine), tuning="a")
+    assert onboard_values(world.files.robot, world)["tilt_max_deg"] == 20
 
 
 def test_a_model_of_ones_own_may_lie_in_the_folder_and_gets_the_parameters(own_robot):
@@ -95,7 +97,7 @@ def test_identify_writes_a_response_for_a_robot_on_the_ground(
     call("run ground.yaml --mode virtual --out run")
     found = as_json("identify run")
     assert found["robot_yaml"] == "response"
-    response = known_robot("rover").response
+    response = find_robot("rover").response
     assert found["gain"][2] == 0.0
     assert (found["explained"][2], found["half_width_95"]["gain"][2]) == (None, None)
     assert "stays on the ground" in call("identify run --out other.yaml").out

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 import cloudrc
-from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import World
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.physics.sim.airframe import read_airframe
 from cloudrc.physics.sim.scene import compile_model
-from cloudrc.robots import build
 from cloudrc.robots.build import build_robot
 
 STEPS = {"mission.steps.count": 3, "link.profile": "paper-p2"}
@@ -58,7 +56,7 @@ def test_the_rotors_of_the_nano_push_and_turn_as_those_of_a_crazyflie():
         "back_left": (1, 1, -1),
         "front_left": (1, -1, 1),
     }
-    world = World.model_validate({"robot": "nano", "scene": "empty"})
+    world = ResolvedWorld.model_validate({"robot": "nano", "scene": "empty"})
     robot = build_robot(world, ResolvedGuard.model_validate({}))
     frame = read_airframe(robot.simulator.model)
     roll, pitch, _, yaw = frame.wrench
@@ -70,13 +68,11 @@ def test_flights_of_a_sweep_share_the_compiled_model_as_copies(monkeypatch):
     """An onboard controller of a user may change the model that it gets."""
     compiled = []
     monkeypatch.setattr(
-        build,
-        "compile_model",
+        "cloudrc.physics.sim.scene.compile_model",
         lambda *files: compiled.append(compile_model(*files)) or compiled[-1],
     )
-    world, limits = World.model_validate({"robot": "x2", "scene": "empty"}), ResolvedGuard()
-    with reuse_results():
-        first, second = (build_robot(world, limits).simulator.model for _ in range(2))
+    world, limits = ResolvedWorld.model_validate({"robot": "x2", "scene": "empty"}), ResolvedGuard()
+    first, second = (build_robot(world, limits).simulator.model for _ in range(2))
     assert len(compiled) == 1
     first.body_mass[:] = 0.0
     assert second.body_mass.any()

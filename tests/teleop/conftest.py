@@ -17,8 +17,8 @@ import pytest
 
 from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.cloud.operator import EmergencyStopRepeater
-from cloudrc.config.hull import hull_of
 from cloudrc.config.load import read_experiment
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.flight.assembly import build_plan
 from cloudrc.physics.geometry.scene import load_scene
 from cloudrc.teleop import store
@@ -45,7 +45,7 @@ from tests.fences import FENCE
 from tests.support.http import ask
 
 PERIOD_NS = 10_000_000
-PELICAN, PAPER = hull_of("pelican"), read_experiment("paper")
+PELICAN, PAPER = ResolvedWorld(robot="pelican").files.hull, read_experiment("paper")
 A, B, C = (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (3.0, 0.0, 1.0)
 AWAY = (0.0, -5.0, 1.0)
 ID = 7
@@ -333,7 +333,7 @@ class Running:
         self.flight.uplink = uplink
         self.alarms, self.complaints, self.log = [], [], []
         self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
-        reader = RequestReader(PAPER.world, partial(build_plan, PAPER))
+        reader = RequestReader(PAPER.world.files, partial(build_plan, PAPER))
         app = create_app(self.bridge, reader, self.complaints.append)
         tokens = None if unix else Tokens(folder, self.complaints.append)
         self.gate = Gate(app, tokens, self.log.append)

@@ -175,17 +175,14 @@ def draw(apart: str = "; ") -> None:
 
     If it cannot render, tell why and, after `apart`, what to do; end this process.
     """
-    from cloudrc.config.robot import known_robot
-    from cloudrc.config.shipped import file_of
+    from cloudrc.config.world import ResolvedWorld
     from cloudrc.physics.sim.camera import Camera
     from cloudrc.physics.sim.engine import at_rest
-    from cloudrc.physics.sim.scene import compile_model
 
-    robot = known_robot("x2")
-    assert robot.camera is not None, "the shipped robot has a camera"
-    model = compile_model(robot.model, file_of("pipes"))
+    files = ResolvedWorld(robot="x2").files
+    assert files.robot.camera is not None, "the shipped robot has a camera"
     try:
-        camera = Camera(model, at_rest(model), robot.camera)
+        camera = Camera(files.compiled, at_rest(files.compiled), files.robot.camera)
     except MissingPrerequisiteError as error:
         print(*filter(None, (error.cause, error.fix)), sep=apart)
         sys.exit(error.exit_code)

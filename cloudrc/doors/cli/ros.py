@@ -108,8 +108,6 @@ def _in_pod(options: Options) -> _Flight:
 def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any]:
     """Open the bridge and the reader of cloud's records; `stack` closes them."""
     from cloudrc.config.load import read_experiment, robot_settings
-    from cloudrc.config.robot import find_robot
-    from cloudrc.config.scene import scene_of
     from cloudrc.doors.bridges.ros2.bridge import RosBridge, Shown
     from cloudrc.doors.bridges.ros2.description import RobotFrames, covariances, urdf
     from cloudrc.doors.bridges.ros2.requests import RosRequests
@@ -119,11 +117,11 @@ def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any
     from cloudrc.results.report.shapes import read_shapes
 
     world = read_experiment(str(flight.config), robot_settings(flight.robot)).world
-    robot = find_robot(world.robot)
+    robot = world.files.robot
     name = options.namespace.strip("/")
     frames = RobotFrames(f"{name}/" if name else "", options.rep_105)
     bodies = read_shapes(world)
-    markers = encode_markers(0, scene_shapes(bodies, scene_of(world), frames.prefix))
+    markers = encode_markers(0, scene_shapes(bodies, world.files.scene, frames.prefix))
     description = urdf(world.robot, frames, bodies.robot)
     exactness, navigates = covariances(world.sensors), not options.no_navigation
     sensors = bodies.scanner, bodies.camera

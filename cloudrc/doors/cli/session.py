@@ -100,14 +100,14 @@ def _up(options: Options) -> int:
 def propose(config: Path) -> tuple[str, str]:
     """Return a mission and a point that fit the scene and the robot of an experiment's file."""
     from cloudrc.config.load import read_experiment
-    from cloudrc.config.robot import is_planar
-    from cloudrc.config.scene import scene_of
     from cloudrc.config.shipped import names
 
-    world = read_experiment(config, flown=True).world
-    x, y, z = scene_of(world).spawn
-    point = f"{x + 1:g} {y:g}" if is_planar(world.robot) else f"{x + 0.5:g} {y:g} {z + 1.1:g}"
-    return world.scene if world.scene in names("mission") else "MISSION.yaml", point
+    experiment = read_experiment(config, flown=True)
+    x, y, z = experiment.scene.spawn
+    scene = experiment.world.scene
+    is_planar = experiment.robot.planar
+    point = f"{x + 1:g} {y:g}" if is_planar else f"{x + 0.5:g} {y:g} {z + 1.1:g}"
+    return scene if scene in names("mission") else "MISSION.yaml", point
 
 
 @contextmanager

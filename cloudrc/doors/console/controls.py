@@ -19,9 +19,7 @@ import numpy as np
 import viser
 
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.robot import is_planar
-from cloudrc.config.scene import scene_of
-from cloudrc.config.schema import World
+from cloudrc.config.world import WorldFiles
 from cloudrc.doors.console.feed import FlightFeed
 from cloudrc.doors.console.steering import SLIDERS, Reply, Steering
 from cloudrc.physics.geometry.obstacles import fence_of
@@ -66,14 +64,14 @@ class Controls:
         acts: dict[str, Callable[[], Reply]],
         steering: Steering,
         feed: FlightFeed,
-        world: World,
+        files: WorldFiles,
     ) -> None:
         """Add the controls to the panel and the scene of a browser.
 
-        `acts` are those of `acts_of`; `world` tells robot and scene.
+        `acts` are those of `acts_of`; `files` are robot and scene.
         """
-        self._steering, self._feed, self._is_planar = steering, feed, is_planar(world.robot)
-        scene = scene_of(world)
+        self._steering, self._feed, self._is_planar = steering, feed, files.robot.planar
+        scene = files.scene
         fence, self._spawn = fence_of(scene), scene.spawn
         self._limits: tuple[Vector, Vector] = fence.inner_low, fence.inner_high  # corners [m]
         if self._is_planar:

@@ -20,7 +20,6 @@ import rich
 import viser
 
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.scene import scene_of
 from cloudrc.doors.console.access import PARAMETER, Access
 from cloudrc.doors.console.controls import KEYS, Controls, acts_of
 from cloudrc.doors.console.door import Door, scene_page, viser_at
@@ -117,7 +116,7 @@ class Page:
         self._due = -inf  # time of the next slow update [s]
         self._drawn = 0  # number of drawn points of the trail
         self._picture: viser.GuiImageHandle | None = None
-        scene, shapes = scene_of(experiment.world), read_shapes(experiment.world)
+        scene, shapes = experiment.scene, read_shapes(experiment.world)
         self._scene = FlightScene(self._server, experiment, shapes, scene, ASPECT)
         self._add_panels(with_legend=bool(scene.tubes))
         self._server.on_client_connect(self._welcome)
@@ -223,8 +222,8 @@ class Page:
             if is_pilot:
                 self.pilot = client.client_id
         if is_pilot:
-            world = self._experiment.world
-            self._controls = Controls(client, self.acts, self.steering, self._feed, world)
+            files = self._experiment.world.files
+            self._controls = Controls(client, self.acts, self.steering, self._feed, files)
         else:
             client.gui.add_markdown("**Read only**: another browser steers.", order=0)
 

@@ -13,10 +13,8 @@ from typing import NamedTuple
 
 from cloudrc.base.errors import CloudrcError
 from cloudrc.base.outside.paths import lock
-from cloudrc.config.hull import known_hull
 from cloudrc.config.load import read_experiment, robot_settings
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.scene import scene_of
 from cloudrc.doors.console.feed import FlightFeed
 from cloudrc.doors.console.page import Page
 from cloudrc.doors.console.pictures import PictureFeed
@@ -63,8 +61,8 @@ def serve(
         text = "this run has a console already; open its page, or end it first"
         lock(opened.enter_context(flight.config.open()), text)
         experiment = flight.experiment()
-        known = obstacles(scene_of(experiment.world), touch=experiment.mission.touched)
-        feed = FlightFeed(tuple(filter(has_surface, known)), known_hull(experiment.world.robot))
+        known = obstacles(experiment.scene, touch=experiment.mission.touched)
+        feed = FlightFeed(tuple(filter(has_surface, known)), experiment.world.files.known_hull)
         steering = Steering(flight.api, flight.link)
         # A proxy reaches a pod at its own address, which the NetworkPolicy guards.
         host = "0.0.0.0" if flight.token and origins else "127.0.0.1"

@@ -20,7 +20,6 @@ from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.config.compute import check_unshared
 from cloudrc.config.load import load_experiment, read_experiment, robot_settings
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.robot import known_robot
 from cloudrc.flight import assembly
 from cloudrc.flight.drivers.background import Background
 from cloudrc.flight.drivers.channels import find_channel
@@ -113,7 +112,7 @@ def run_cloud(
         )
         end.readers, cloud.watch = readers, readers.see
         cloud.sight.watch_frame = lambda frame: readers.show_picture(frame.stamp_ns, frame.image)
-        if (scan := known_robot(experiment.world.robot).scan) is not None:
+        if (scan := experiment.robot.scan) is not None:
             cloud.sight.watch_scan = lambda *sent: readers.show(scan_record(scan, *sent))
 
         def flies() -> bool:
@@ -271,7 +270,7 @@ def link_monitor(experiment: ResolvedExperiment, *, uplink: bool, trusted: bool)
     rate = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
     size = COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
     if uplink:
-        size = TELEMETRY_SIZES[len(known_robot(experiment.world.robot).sensors)]
+        size = TELEMETRY_SIZES[len(experiment.robot.sensors)]
     flow = Flow(experiment.seed, uplink, kind, size, experiment.stream)
     computes, file_max = bool(experiment.cloud.compute_ms), SIZE_MAX if trusted else TRACE_MAX
     check = LinkMonitor(uplink, flow, period=1.0 / rate, computes=computes, file_max=file_max)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 from cloudrc.base.errors import to_one_line
 from cloudrc.config.load import read_experiment
-from cloudrc.config.scene import scene_of
 from cloudrc.flight.drivers.readers import RecordReader
 from cloudrc.flight.runs.interrupts import interrupt_on_signals, until_interrupted
 from cloudrc.results.record.ros import definition
@@ -41,7 +40,7 @@ def main(folder: Path, port: int) -> None:
         socket = Path(under_way()[folder].removeprefix("unix:"))
         world = read_experiment(str(folder / "config.yaml")).world
         shapes = read_shapes(world)
-        bodies = scene_shapes(shapes, scene_of(world))
+        bodies = scene_shapes(shapes, world.files.scene)
         views = LiveViews(bodies, shapes.scanner, shapes.camera)
         reader = RecordReader(socket.parent)
         stack.callback(reader.close)

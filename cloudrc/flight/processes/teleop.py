@@ -16,11 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.base.files import write_atomically
-from cloudrc.base.outside.reuse import reuse_results
-from cloudrc.config.hull import hull_of
 from cloudrc.config.load import read_experiment, robot_settings
-from cloudrc.config.robot import known_robot
-from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.flight import assembly
 from cloudrc.flight.drivers.link_news import LinkNews
 from cloudrc.flight.drivers.process import Feed, GracefulStop, StopSignal
@@ -64,14 +60,12 @@ class TeleopSettings:
     robot: int | None = None  # number in a fleet
 
 
-@reuse_results()  # robot and scene stay those of the start
 def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
     """Run teleop until `stop` or, with `start`, until the mission has ended."""
     experiment = read_experiment(str(settings.config), robot_settings(settings.robot))
     exporter = open_exporter("teleop", experiment, settings.metrics)
-    world = experiment.world
     plan, touch = partial(assembly.build_plan, experiment), experiment.mission.touch
-    reader = RequestReader(world, plan, touch)
+    reader = RequestReader(experiment.world.files, plan, touch)
     with ExitStack() as opened:
         server = _serve_api(settings, reader)
         opened.callback(server.stop)
@@ -79,9 +73,9 @@ def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
         if book is None:  # stopped while another teleop process locked the journal
             return
         opened.callback(book.close)
-        sensors, limit = known_robot(world.robot).sensors, experiment.guard.speed_max_mps
-        units = {name: each.unit for name, each in sensors.items()}
-        place = steered_in(world), scene_of(world), hull_of(world.robot)
+        files, limit = experiment.world.files, experiment.guard.speed_max_mps
+        units = {name: each.unit for name, each in files.robot.sensors.items()}
+        place = files.fence, files.scene, files.hull
         service = MissionService(book, *place, units, speed_max=limit)
         if settings.start and not book.missions:  # else an earlier process has begun it
             order = Order(assembly.build_plan(experiment), experiment.name, touch=touch)

@@ -15,7 +15,8 @@ from cloudrc.config.overrides import OUTSIDE, Settings, naming_settings, parse_s
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import has_mujoco
-from cloudrc.config.schema import Parameters, World
+from cloudrc.config.schema import Parameters
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.flight.drivers.channels import find_channel
 from cloudrc.flight.drivers.machine import usable_cores
 from cloudrc.flight.runs.requirements import require
@@ -120,7 +121,7 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
         find_channel(controller).get("check")()
 
 
-def check_world(world: World, *, turns: bool = False) -> None:
+def check_world(world: ResolvedWorld, *, turns: bool = False) -> None:
     """Check that the robot can move in its scene as `world` says, and with `turns` obeys a yaw.
 
     The shipped robots can in the shipped scenes, if nothing is changed. Without MuJoCo, such as on

@@ -11,7 +11,6 @@ from typing import Any, TypeAlias
 from cloudrc.base import plugins
 from cloudrc.base.errors import describe_error, machine_error
 from cloudrc.base.outside import code
-from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.time_line import link_start
 from cloudrc.flight import assembly
@@ -99,7 +98,6 @@ def units(own: Iterable[str]) -> dict[str, str]:
     return {metric.name: metric.unit for metric in map(find, names)}
 
 
-@reuse_results()  # a flight looks ten times at the file of its robot
 def fly_in_memory(experiment: ResolvedExperiment) -> Assessment:
     """Fly an experiment in virtual time, and measure and judge it, without any file."""
     store = RecordStore()

@@ -11,7 +11,7 @@ from typing import Any
 from cloudrc.base.files import write_atomically
 from cloudrc.base.outside.paths import check_picture
 from cloudrc.config import shipped
-from cloudrc.config.schema import World
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.flight.runs.requirements import missing
 from cloudrc.results.report.shapes import read_shapes
 from cloudrc.robots.check import SCENE, check, facts_table
@@ -43,7 +43,7 @@ def check_robot(given: str, picture: Path | None = None) -> tuple[dict[str, Any]
         return document, "no picture: cloudrc[report] is not installed"
     from cloudrc.results.report.robot_picture import draw_robot
 
-    shapes = read_shapes(World.model_validate({"robot": name, "scene": SCENE}))
+    shapes = read_shapes(ResolvedWorld.model_validate({"robot": name, "scene": SCENE}))
     write_atomically(place, draw_robot(shapes.robot, place.suffix[1:]))
     return document, f"picture: {place}"
 

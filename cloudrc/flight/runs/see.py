@@ -23,8 +23,6 @@ from cloudrc.cloud.perceptions import Frame, Perception, Scan, Seen
 from cloudrc.config.choice import PlugIn
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.robot import facts, known_robot
-from cloudrc.config.scene import steered_in
 from cloudrc.physics.geometry.rays import angles_of
 from cloudrc.results.metrics.flight import rows_of
 from cloudrc.results.record.columns import Recording
@@ -64,13 +62,12 @@ def look_again(run: Path, name: str | None) -> list[SecondLook]:
 
 
 def _build(experiment: ResolvedExperiment, name: str | None) -> Perception:
-    choice, guard = experiment.cloud.perception, experiment.guard
+    choice = experiment.cloud.perception
     if name is not None:
         choice = PlugIn(name=str(Path(name).resolve()) if plugins.is_path(name) else name)
     if choice is None:
         raise InvalidValueError("the flight had no perception; name one with --perception")
-    robot = facts(experiment.world, guard.acceleration_max_mps2, guard.speed_max_mps)
-    perception: Perception = build_plugin("perceptions", choice, robot=robot)
+    perception: Perception = build_plugin("perceptions", choice, robot=experiment.robot_facts)
     return perception
 
 
@@ -82,7 +79,7 @@ def _look(
     Cloud may have had an older one, and a perception that was busy saw less.
     """
     flight, odometry = flight_of(recording, experiment), recording["/odometry"]
-    fence, steered = steered_in(experiment.world), recording["/perception"]
+    fence, steered = experiment.world.files.fence, recording["/perception"]
     flown = dict(rows_of(steered, "seen_stamp_ns", "position"))
     measured = [*starmap(Odometry, rows_of(odometry, "stamp_ns", *Odometry._fields[1:]))]
 
@@ -105,7 +102,7 @@ def _look(
 
 def _seen(recording: Recording, experiment: ResolvedExperiment, sensor: str) -> Iterator[Seen]:
     """Yield what cloud had, in the order in which it was shown."""
-    robot = known_robot(experiment.world.robot)
+    robot = experiment.robot
     kept = recording["/scan" if sensor == "scan" else "/camera"]
     if not len(kept):
         kind = "scans" if sensor == "scan" else "pictures; fly again with --set camera.keep=true"

@@ -14,7 +14,6 @@ from pathlib import Path
 from cloudrc.base.errors import InvalidRunError, NothingFlownError
 from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment, dump
-from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.flight.assembly import with_order
 from cloudrc.results.record.columns import Recording
@@ -70,7 +69,7 @@ def experiment_of(
     """
     if mission.order.plan.by_hand:  # rest at the start, until the report has the setpoints
         rest = [(time, mission.order.plan.legs[0].position) for time in (0.0, 1.0)]
-        drive = write_setpoints(rest, steered_in(session.world))
+        drive = write_setpoints(rest, session.world.files.fence)
         (folder / DRIVE_FILE).write_text(drive, encoding="utf-8")
     return with_order(session, mission.order, about)
 

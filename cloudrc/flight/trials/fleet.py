@@ -18,7 +18,6 @@ from statistics import median
 from typing import Any
 
 from cloudrc.base.outside.code import apart
-from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.config.fleet import CellConfig
 from cloudrc.config.overrides import OUTSIDE
 from cloudrc.config.problems import problem_at
@@ -62,7 +61,6 @@ def fly_fleet(
     """Fly, judge and measure a fleet; its robots get its seed. Return the results of the row."""
 
     @apart()
-    @reuse_results()
     def fly() -> Row:
         seed = {"seed": fleet.seed}
         flown = FleetFlight(fleet, [each.model_copy(update=seed) for each in robots])

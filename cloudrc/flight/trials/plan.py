@@ -196,6 +196,7 @@ def unpack(path: Path) -> list[PlannedFlight]:
         points = json.loads(gzip.decompress(files.read(path)))
         for told, point, values, seeds, beside_ideal in points:
             resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
+            _ = resolved.robot  # read here, so that workers get it, and share it
             first = _first_flight(point, seeds[0], resolved, beside_ideal=beside_ideal)
             flights += [first._replace(seed=seed) for seed in seeds]
             if told != first.fingerprint:

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from cloudrc.base import source
 from cloudrc.base.text import Paint, cells, escape, list_some, plain, table
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
-from cloudrc.config.scene import scene_of
 from cloudrc.config.time_line import link_start
 from cloudrc.link.cell import Usage
 from cloudrc.link.waiting import md1, nddd1
@@ -141,7 +140,7 @@ def fleet_document(flown: FleetFlown) -> dict[str, Any]:
         "link_start": link_start(experiment),
         "cell": cell_rows(flown.log, len(flown.robots), alone=alone),
         "cloud": flown.cloud,
-        "separation_min_m": separation_min(flown.paths, scene_of(experiment.world).spawn),
+        "separation_min_m": separation_min(flown.paths, experiment.scene.spawn),
     }
 
 

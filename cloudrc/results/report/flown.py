@@ -7,10 +7,7 @@ from __future__ import annotations
 from cloudrc.base.errors import MissingPrerequisiteError
 from cloudrc.base.outside.refusal import naming
 from cloudrc.config.flown import FLOWN_FILE, FlownWorld
-from cloudrc.config.hull import known_hull
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.robot import is_planar
-from cloudrc.config.scene import scene_of
 from cloudrc.physics.geometry.shapes import SHAPES_FILE, Shapes
 from cloudrc.results.metrics.flight import Flight
 from cloudrc.results.record.columns import Recording
@@ -32,8 +29,7 @@ def flown_world(recording: Recording, experiment: ResolvedExperiment) -> FlownWo
     """
     if (data := recording.attachments.get(FLOWN_FILE)) is not None:
         return FlownWorld.from_bytes(data)
-    world = experiment.world
-    return FlownWorld(scene_of(world), known_hull(world.robot), is_planar(world.robot))
+    return FlownWorld.of(experiment.world.files)
 
 
 def flown_shapes(recording: Recording, experiment: ResolvedExperiment) -> Shapes:

@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from cloudrc.config.robot import known_robot
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.flight.runs.requirements import SIM, require
 from cloudrc.gym.linear import Linear
 from cloudrc.gym.testbed import RobotEnv
@@ -76,7 +76,8 @@ class FourMotors(gymnasium.Env[Floats, Floats]):
         from cloudrc.physics.sim.engine import mujoco
 
         self._mujoco = mujoco
-        self._model = mujoco.MjModel.from_xml_path(str(known_robot("nano").model))
+        nano = ResolvedWorld(robot="nano").files.robot
+        self._model = mujoco.MjModel.from_xml_path(str(nano.model))
         self._model.opt.timestep = self.dt / PHYSICS
         self._data = mujoco.MjData(self._model)
         self._motors = [self._model.actuator(name).id for name in MOTORS]

@@ -6,7 +6,7 @@ from math import isnan
 
 import pytest
 
-from cloudrc.config.hull import hull_of
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.doors.console.feed import (
     CHARTED_FROM,
     DOWNLINK,
@@ -67,7 +67,7 @@ def test_error_and_estimate_are_unknown_without_control(feed):
 
 
 def test_the_trail_is_coloured_by_the_clearance_from_the_pipes():
-    feed = FlightFeed(load_scene("pipes").tubes, hull_of("pelican"))
+    feed = FlightFeed(load_scene("pipes").tubes, ResolvedWorld(robot="pelican").files.hull)
     feed.take(status(0.1, (0.5, 0.0, 0.7)), 1.0)
     feed.take(status(0.2, (0.505, 0.0, 0.7)), 1.1)  # too near to be a new point
     feed.take(status(0.3, (0.7, 0.0, 0.7)), 1.2)

@@ -228,7 +228,9 @@ def test_the_first_view_shows_the_whole_mission(filled):
 
 def test_controls_of_a_browser_that_left_do_not_end_the_console(filled):
     page, _, steering = filled("hover")
-    page._controls = Controls(page._server, page.acts, steering, page._feed, page._experiment.world)
+    page._controls = Controls(
+        page._server, page.acts, steering, page._feed, page._experiment.world.files
+    )
     slider = page._controls._sliders["uplink.delay_ms"]
     steering.conditions = {"uplink.delay_ms": 60.0}
     page.update(1.0)
@@ -252,7 +254,7 @@ def test_what_is_unknown_is_a_gap_in_its_chart(filled):
 @pytest.mark.parametrize(("name", "axes"), [("hover", 3), ("pillars", 2)])
 def test_controls_have_heights_only_for_a_robot_that_flies(filled, name, axes):
     page, _, steering = filled(name)
-    controls = Controls(page._server, page.acts, steering, page._feed, page._experiment.world)
+    controls = Controls(page._server, page.acts, steering, page._feed, page._experiment.world.files)
     handles = page._server.gui._gui_input_handle_from_uuid.values()
     labels = {handle.label for handle in handles if hasattr(handle, "label")}
     keys = {label for label, direction in KEYS.values() if axes == 3 or not direction[2]}

@@ -11,7 +11,6 @@ import numpy as np
 
 from cloudrc.config.load import read_experiment
 from cloudrc.config.mission_check import check_mission
-from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import MissionConfig
 from cloudrc.flight import assembly
 from cloudrc.physics.geometry.obstacles import fence_of
@@ -208,7 +207,7 @@ def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
 )
 def _impossible(outcome: Outcome) -> None:
     experiment, first = read_experiment("paper"), (0.5, 0.0, 0.8)
-    scene = scene_of(experiment.world)
+    scene = experiment.scene
     points: dict[str, Vector] = {
         "1 m behind a wall of the fence": (fence_of(scene).high[0] + 1.0, 0.0, 1.0),
         "far below the floor": (0.0, 0.0, -5.0),
@@ -227,7 +226,7 @@ def _impossible(outcome: Outcome) -> None:
             mission = MissionConfig.model_validate(
                 {"waypoints": waypoints, "touch": experiment.mission.touch}
             )
-            problems = [str(each) for each in check_mission(mission, experiment.world)]
+            problems = [str(each) for each in check_mission(mission, experiment.world.files)]
         except ValueError as error:
             problems = [str(error)]
         outcome.true(f"{name}: rejected", bool(problems))

@@ -11,6 +11,7 @@ from functools import partial
 import pytest
 
 from cloudrc.base.outside.reuse import reuse
+from cloudrc.config.load import load_experiment
 from cloudrc.flight.trials.workers import map_in_order, take_each
 from tests.conftest import wait_until
 
@@ -29,6 +30,11 @@ def two_cores_and_a_terminal(monkeypatch):
 def _slow_first(number):
     time.sleep(0.2 * (number == 0))
     return number, os.getpid()
+
+
+def _look_at(experiment):
+    files = experiment.world.files
+    return os.getpid(), id(files), id(files.compiled)
 
 
 def _kill_at_five(folder, number):
@@ -51,6 +57,14 @@ def test_results_keep_the_order_of_the_work(pieces, jobs, workers, monkeypatch):
 
 def _shared(number):
     return reuse("shared", lambda: (number, os.getpid()))
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_flights_of_a_sweep_share_robot_and_scene_once_a_worker(jobs):
+    first = load_experiment("hover", ["world.scene=empty"])
+    flights = [first.model_copy(update={"seed": seed}) for seed in range(6)]
+    found = {*map_in_order(_look_at, flights, jobs)}
+    assert len(found) == len({pid for pid, *_ in found}) <= jobs
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

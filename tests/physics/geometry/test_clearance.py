@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.base.errors import MissingPrerequisiteError
-from cloudrc.config.hull import hull_of, known_hull
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.physics.geometry.clearance import (
     clearance,
     clearance_per_obstacle,
@@ -22,7 +22,7 @@ from cloudrc.physics.geometry.scene import Tube, load_scene
 
 PIPES = load_scene("pipes")
 TUBES = PIPES.tubes
-FEW = hull_of("pelican")
+FEW = ResolvedWorld(robot="pelican").files.hull
 ALONG_X = Tube("pipe_x", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5.0, 0.662, 0.700)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 
@@ -85,7 +85,7 @@ def test_the_ball_of_a_robot_holds_its_geoms(tmp_path, monkeypatch):
         '<body pos="0 .5 0"><geom type="cylinder" size=".12 .05" euler="90 0 0"/></body>'
         "</body></worldbody></mujoco>"
     )
-    assert hull_of(str(tmp_path)).radii == pytest.approx([0.5629], abs=1e-3)
+    assert ResolvedWorld(robot=str(tmp_path)).files.hull.radii == pytest.approx([0.5629], abs=1e-3)
     absent = Mock(side_effect=MissingPrerequisiteError("the simulator needs MuJoCo"))
     monkeypatch.setattr("cloudrc.physics.sim.bodies.reach_of", absent)
-    assert known_hull(str(tmp_path)) is None
+    assert ResolvedWorld(robot=str(tmp_path)).files.known_hull is None

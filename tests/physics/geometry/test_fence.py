@@ -6,8 +6,7 @@ import pytest
 
 from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
-from cloudrc.config.scene import scene_of
-from cloudrc.config.schema import World
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.physics.geometry.fence import Fence
 from cloudrc.physics.geometry.obstacles import fence_of
 from cloudrc.physics.geometry.scene import SCENES, load_scene
@@ -19,7 +18,7 @@ HOVER = "mission={waypoints: [{position_m: [0, 0, 1]}]}"
 
 def fence_in(scene):
     """Return the fence of a scene."""
-    return fence_of(scene_of(World(scene=scene)))
+    return fence_of(ResolvedWorld(scene=scene).files.scene)
 
 
 @pytest.fixture

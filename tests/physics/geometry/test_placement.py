@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.hull import hull_of
 from cloudrc.config.mission_check import check_mission, check_scene
-from cloudrc.config.schema import MissionConfig, Steps, Touch, Waypoint, World
+from cloudrc.config.schema import MissionConfig, Steps, Touch, Waypoint
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.physics.geometry.clearance import clearance
 from cloudrc.physics.geometry.obstacles import obstacles
 from cloudrc.physics.geometry.placement import (
@@ -22,7 +22,7 @@ from cloudrc.physics.geometry.placement import (
 from cloudrc.physics.geometry.scene import load_scene
 
 KNOWN = obstacles(load_scene("pipes"), touch="board")
-FEW = hull_of("pelican")
+FEW = ResolvedWorld(robot="pelican").files.hull
 BESIDE_AND_ALONG = (0.5, 0.0, 1.2), (2.821, -6.418, 0.7)
 """A point beside the third pipe, and one before its mouth [m]."""
 
@@ -39,7 +39,7 @@ def refusals(*positions, start="spawn", scene="pipes", **more):
     waypoints = tuple(Waypoint(position_m=position, **more) for position in positions)
     touch = Touch(body="board") if scene == "pipes" else None
     mission = MissionConfig(start=start, waypoints=waypoints, touch=touch)
-    problems = check_mission(mission, World(scene=scene))
+    problems = check_mission(mission, ResolvedWorld(scene=scene).files)
     return "\n".join(map(str, problems))
 
 
@@ -85,11 +85,13 @@ def test_a_waypoint_that_the_guard_forbids_is_refused(position, tolerance, outsi
     ],
 )
 def test_steps_that_can_end_in_a_wall_are_refused(steps, scene, reason):
-    (problem,) = check_mission(MissionConfig(steps=Steps(**steps)), World(scene=scene))
+    (problem,) = check_mission(
+        MissionConfig(steps=Steps(**steps)), ResolvedWorld(scene=scene).files
+    )
     assert problem.path == ("steps",)
     assert reason in problem.reason
     both = MissionConfig(waypoints=(Waypoint(position_m=(0.0, 0.0, 1.0)),), steps=Steps(**steps))
-    assert "not both" in str(check_mission(both, World())[0])
+    assert "not both" in str(check_mission(both, ResolvedWorld().files)[0])
 
 
 POST = '<body name="post" pos="1.2 0 1"><geom type="capsule" size=".05 1"/></body>'
@@ -107,7 +109,9 @@ GROUND = '<geom type="plane" size="5 5 .1"/>'
 )
 def test_every_body_of_a_scene_of_ones_own_is_in_the_way(scene_with, bodies, waypoints, reason):
     mission = MissionConfig(waypoints=tuple(Waypoint(position_m=each) for each in waypoints))
-    said = "\n".join(map(str, check_mission(mission, World(scene=scene_with(bodies)))))
+    said = "\n".join(
+        map(str, check_mission(mission, ResolvedWorld(scene=scene_with(bodies)).files))
+    )
     assert reason in said if reason else said == ""
 
 
@@ -121,6 +125,6 @@ def test_every_body_of_a_scene_of_ones_own_is_in_the_way(scene_with, bodies, way
     ],
 )
 def test_a_scene_fits_its_missions(scene_with, bodies, touch, path, reason):
-    problems = check_scene(World(scene=scene_with(bodies)), touch)
+    problems = check_scene(ResolvedWorld(scene=scene_with(bodies)).files, touch)
     assert [problem.path for problem in problems] == ([path] if path else [])
     assert all(reason in problem.reason for problem in problems)

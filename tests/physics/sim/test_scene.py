@@ -12,8 +12,8 @@ from cloudrc.base.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.base.outside.values import InvalidValueError
 from cloudrc.config.disturbances import Plant
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of, names
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.physics.sim.engine import import_mujoco
 from cloudrc.physics.sim.scene import bodies_of_geoms
 from cloudrc.robots.build import check_robot
@@ -111,7 +111,7 @@ def test_what_cannot_be_flown_is_refused_by_name(tmp_path, monkeypatch, kind, ol
     assert old in good
     path.write_text(good.replace(old, new))
     with pytest.raises(BadInputError, match=rf"^[^\n]*mine.xml[^\n]*{message}[^\n]*$"):
-        check_robot(World(**{kind: str(path)}))
+        check_robot(ResolvedWorld(**{kind: str(path)}))
     assert list(tmp_path.iterdir()) == [path], "MuJoCo wrote a log"
 
 
@@ -150,8 +150,8 @@ def test_it_is_imported_without_gl(monkeypatch, wanted):
         monkeypatch.setenv("MUJOCO_GL", wanted)
     import_mujoco()
     assert os.environ.get("MUJOCO_GL") == wanted
-    robot = "from cloudrc.config.schema import World; from cloudrc.robots.build import check_robot"
-    loaded(f"{robot}; check_robot(World())")
+    imports = "from cloudrc.config.world import ResolvedWorld as World"
+    loaded(f"{imports}\nfrom cloudrc.robots.build import check_robot\ncheck_robot(World())")
 
 
 def test_without_the_package_the_extra_is_named(monkeypatch):

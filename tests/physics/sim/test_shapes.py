@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from cloudrc.config.schema import World
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.physics.geometry.shapes import Shapes
 from cloudrc.physics.sim.engine import mujoco
 from cloudrc.results.report.shapes import read_shapes
@@ -49,7 +49,10 @@ def scene(tmp_path_factory):
 
 
 def test_every_type_of_geom_has_its_place_size_and_colour(scene):
-    found = {each.body: each for each in read_shapes(World(robot="rover", scene=str(scene))).scene}
+    found = {
+        each.body: each
+        for each in read_shapes(ResolvedWorld(robot="rover", scene=str(scene))).scene
+    }
     seen = {"box", "ball", "rod", "can", "egg", "wedge", "hill", "wall", "twin", "coarse"}
     assert found.keys() == seen, "the floor is a grid; a geom without opacity is not drawn"
     model = mujoco.MjModel.from_xml_string(SCENE)
@@ -72,8 +75,8 @@ def test_every_type_of_geom_has_its_place_size_and_colour(scene):
 
 @pytest.mark.parametrize("robot", ["pelican", "x2", "nano", "rover"])
 def test_the_robot_is_in_the_frame_of_its_base(scene, robot):
-    turned = read_shapes(World(robot=robot, scene=str(scene)))
-    level = read_shapes(World(robot=robot, scene="empty"))
+    turned = read_shapes(ResolvedWorld(robot=robot, scene=str(scene)))
+    level = read_shapes(ResolvedWorld(robot=robot, scene="empty"))
     assert turned.planar == (robot == "rover")
     for one, other in zip(turned.robot, level.robot, strict=True):
         assert one.rgba == other.rgba
@@ -82,8 +85,8 @@ def test_the_robot_is_in_the_frame_of_its_base(scene, robot):
 
 def test_the_camera_of_a_robot_looks_along_z_of_its_frame():
     """x of the frame is to the right, y down, as REP-103 says of optical frames."""
-    shapes = read_shapes(World(robot="x2", scene="empty"))
+    shapes = read_shapes(ResolvedWorld(robot="x2", scene="empty"))
     place, turn = Shapes.from_bytes(shapes.to_bytes()).camera
     assert place == pytest.approx((0.1, 0.0, 0.0))
     assert abs(np.dot(turn, (0.5, -0.5, 0.5, -0.5))) == pytest.approx(1.0)
-    assert read_shapes(World(robot="pelican", scene="empty")).camera is None
+    assert read_shapes(ResolvedWorld(robot="pelican", scene="empty")).camera is None

@@ -9,9 +9,9 @@ commands per second. The mission lasts from 10 s to 20 s on the shared clock of 
 from dataclasses import dataclass, field
 from functools import cache
 
-from cloudrc.config.hull import hull_of
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Criteria, MissionConfig, Touch, Waypoint
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.flight.runs.flight import fly_in_memory
 from cloudrc.physics.geometry.scene import Plate, Scene, Tube
 from cloudrc.results.metrics.flight import Flight
@@ -39,7 +39,7 @@ PERIOD = 40_000_000
 UPLINK, DOWNLINK, HORIZON = 0.05, 0.04, 0.08
 
 OPEN_AIR = Scene("empty")
-PELICAN = hull_of("pelican")
+PELICAN = ResolvedWorld(robot="pelican").files.hull
 ONE_PIPE = Scene(
     "pipe",
     (Tube("pipe_1", (4.5, 0.0, 1.0), (1.0, 0.0, 0.0), 5.0, 0.662, 0.7),),

@@ -8,7 +8,6 @@ import pytest
 import viser
 
 from cloudrc.config.load import load_experiment
-from cloudrc.config.scene import scene_of
 from cloudrc.physics.geometry.clearance import CLEARANCE_SHOWN
 from cloudrc.results.report.scene import FlightScene, clearance_colours
 from cloudrc.results.report.shapes import read_shapes
@@ -25,7 +24,7 @@ def shown(server, name, *sets):
     """Show an experiment; return the scene, and its nodes by name."""
     experiment = load_experiment(name, sets)
     world = experiment.world
-    scene = FlightScene(server, experiment, read_shapes(world), scene_of(world))
+    scene = FlightScene(server, experiment, read_shapes(world), world.files.scene)
     return scene, server.scene._handle_from_node_name
 
 

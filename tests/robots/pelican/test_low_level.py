@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from cloudrc.base.errors import BadInputError
-from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.physics.sim.readings import Readings
 from cloudrc.robots.build import check_robot
 from cloudrc.robots.pelican.low_level import (
@@ -51,6 +51,6 @@ def test_a_scene_with_air_is_for_other_robots(tmp_path):
     """The rotors would count the drag twice."""
     scene = tmp_path / "air.xml"
     scene.write_text(file_of("empty").read_text().replace("<option ", '<option density="1.2" '))
-    check_robot(World(scene=str(scene), robot="x2"))
+    check_robot(ResolvedWorld(scene=str(scene), robot="x2"))
     with pytest.raises(BadInputError, match="the rotors of this robot have a drag of their own"):
-        check_robot(World(scene=str(scene)))
+        check_robot(ResolvedWorld(scene=str(scene)))

@@ -22,7 +22,6 @@ from cloudrc.config import shipped
 from cloudrc.config.load import read_experiment
 from cloudrc.config.profile import Profile
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.robot import known_robot
 from cloudrc.config.schema import Experiment
 from cloudrc.flight.drivers.programs import run_tool
 from cloudrc.flight.runs.links.under_test import LOOPBACK, WAYS, Way, inside, measure, run_link
@@ -104,7 +103,7 @@ def make_plans(
 ) -> dict[str, Measurement]:
     """Plan probes in both directions for `seconds` [s] (None: as long as needed)."""
     plans = {}
-    sensors = known_robot(experiment.world.robot).sensors
+    sensors = experiment.robot.sensors
     sizes = SIZES | {int(Kind.TELEMETRY): TELEMETRY_SIZES[len(sensors)]}
     for way, (_, _, kind) in WAYS.items():
         flow = Flow(experiment.seed, way == "uplink", PROBE, sizes[kind])
