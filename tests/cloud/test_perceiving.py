@@ -126,6 +126,13 @@ def test_a_perception_gets_the_odometry_of_its_scan():
     assert len(rig.perception.seen) == 2, "another robot's"
 
 
+def test_odometry_of_the_very_instant_of_a_scan_is_that_of_the_scan():
+    rig = Rig()
+    rig.hear(0, 10)
+    rig.scan(10)
+    assert rig.perception.seen == [(10, 10)]
+
+
 def test_what_a_perception_returns_is_judged():
     rig = Rig()
     rig.hear(0)

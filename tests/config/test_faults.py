@@ -75,6 +75,13 @@ def test_what_is_impossible_is_refused_in_one_line(fault, setting, said):
     assert said in refused_line("steps", setting, *round_, f"faults=[{{{fault}}}]")
 
 
+def test_a_second_fault_of_a_process_begins_later_than_the_first_one_ends():
+    paused = "kind: cloud_paused, at_s: 3, duration_s: 1"
+    assert len(faulty(paused, KILLED.replace("4", "4.1")).faults) == 2
+    with pytest.raises(BadInputError, match="cloud overlap"):
+        faulty(paused, KILLED)  # at 4 s
+
+
 @pytest.mark.parametrize(
     ("faults", "said"),
     [

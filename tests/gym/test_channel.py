@@ -92,6 +92,13 @@ def test_an_observation_arrives_at_the_end_of_its_slot_and_a_newer_one_takes_its
     assert found[1] == [(0, 0), (32, 5), (52, 10)]
 
 
+def test_robots_that_act_at_the_same_time_act_in_the_order_of_their_numbers():
+    """At 10 ms robot 1 has waited for an answer; robot 0 sends only then, and does not wait."""
+    channel = Channel(counters(0.01, 0.02), schedule=None, answer_within=[0.0, 0.01])
+    robots = [robot for robot, *_ in channel.play(1, 0.02)]
+    assert robots == [0, 0, 1, 0, 1]  # at 0, 10, 10, 20 and 30 ms
+
+
 def test_several_leave_in_a_slot_and_without_a_schedule_all_leave_at_once():
     both = seen(Channel(counters(0.01, 0.01), per_slot=2), 0.05)
     assert both == [[(0, 0), *[(10 * n, n - 1) for n in range(2, 5)]]] * 2

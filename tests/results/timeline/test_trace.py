@@ -7,8 +7,8 @@ from collections import defaultdict
 
 import pytest
 
-from cloudrc.results.timeline.loops import of_flight
-from cloudrc.results.timeline.trace import write_trace
+from cloudrc.results.timeline.loops import of_document, of_flight
+from cloudrc.results.timeline.trace import LANES, write_trace
 from tests.results.timeline.conftest import SETTINGS, flight_of
 
 
@@ -80,3 +80,12 @@ def test_slices_of_a_command_are_its_stages(tmp_path):
     counter = int(loop.budget.numbers[20]) & 0xFFFFFFFF
     lasts = [each["dur"] for each in events if each["name"] == f"#{counter}"]
     assert lasts == [33_000, 7_000, 21_000, 1_000, 10_000]
+
+
+def test_slices_that_touch_share_a_track_and_slices_that_overlap_do_not():
+    episode = {"stages": {"uplink": "to the cloud"}, "ticks": [1, 2, 3], "ended": [""] * 3}
+    loop = of_document({**episode, "cuts_ns": [[0, 10, 15], [10, 20, 25]]})
+    events = json.loads(write_trace({"loop": loop}, 0.0, 1.0))["traceEvents"]
+    stage = [each for each in events if each["ph"] == "X" and each["tid"] < 2 * LANES]
+    track_of = {each["name"]: each["tid"] for each in stage}
+    assert track_of == {"#1": LANES, "#2": LANES, "#3": LANES + 1}

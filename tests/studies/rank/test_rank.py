@@ -274,6 +274,12 @@ def test_what_is_not_installed_is_named_with_its_extra(call, monkeypatch):
     assert "cloudrc[arms]" in said
 
 
+def test_a_policy_may_need_an_extra_that_its_task_does_not_need(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if "policy" in name else 1)
+    found = tasks.shipped(["hover-motors", "hover-velocity"])  # the same drone
+    assert {each.policy: each.lacking for each in found} == {"raptor": ["rank"], "velocity": []}
+
+
 @pytest.mark.process
 def test_the_page_sorts_by_every_column_and_can_be_read(write, browse, tmp_path):
     made = {

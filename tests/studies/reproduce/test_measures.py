@@ -49,6 +49,19 @@ def test_delays_have_a_mean_and_half_of_a_range_in_each_part():
     assert [part[0] for part in found["round_trip"]] == pytest.approx([0.09, 0.19], rel=0.02)
 
 
+def test_a_packet_that_is_under_way_as_the_link_changes_counts_in_neither_part():
+    def arrive(_, row):
+        sent = (row.stamp_ns - START) * 1e-9 - row.delay
+        if not CHANGE - 0.1 < sent < CHANGE:
+            return row
+        return row._replace(stamp_ns=row.stamp_ns + at(0.3) - START, delay=row.delay + 0.3)
+
+    log = flown()
+    log.change(Arrival, arrive)
+    halves = [half for _, half in measured(log, CHANGE)["one_way"]]
+    assert halves == pytest.approx([(UPLINK - DOWNLINK) / 2] * 2)
+
+
 def test_a_filter_has_the_spread_of_its_samples_and_of_its_estimate():
     log = steer(late(flown(), 0.1), lambda t: {"horizon": 0.08 if round(t / 0.04) % 2 else 0.06})
     found = measured(log)
