@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults that an experiment injects: their keys, and what they do to the link's time line.
+"""Faults that an experiment injects: their keys, and what they do to the link's schedule.
 
 `cloudrc.flight.drivers.faults` injects those of processes and clocks.
 """
@@ -115,10 +115,10 @@ def acting(faults: Iterable[FaultConfig], *kinds: str) -> list[FaultConfig]:
 def refusal(
     faults: Sequence[FaultConfig], *ways: DirectionConfig, goes_round: bool, is_fleet: bool
 ) -> str:
-    """Say why a flight over a link with these time lines cannot have the faults; "" if it can."""
+    """Say why a flight over a link with these schedules cannot have the faults; "" if it can."""
     link = acting(faults, *OF_LINK)
     if link and (goes_round or any(way.loop for way in ways)):
-        return "faults: the time line of the link goes round; leave out loop, or start_s: random"
+        return "faults: the schedule of the link repeats; leave out loop, or start_s: random"
     if any(fault.kind != PARTITION for fault in link) and any(way.trace for way in ways):
         return (
             "faults: a trace gives the delays and losses of the link; only a partition is possible"
@@ -146,7 +146,7 @@ def refusal_in(mode: str, faults: Sequence[FaultConfig]) -> str:
 def with_faults(
     way: DirectionConfig, faults: Iterable[FaultConfig], start: float
 ) -> DirectionConfig:
-    """Write faults of a direction into its time line, in which the flight begins at `start` [s]."""
+    """Write faults of a direction into its schedule, in which the flight begins at `start` [s]."""
     moved = [fault.model_copy(update={"at_s": fault.at_s + start}) for fault in faults]
     cuts = [
         BlackoutConfig.model_validate({"start_s": fault.at_s, "duration_s": fault.length})

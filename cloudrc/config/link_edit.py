@@ -18,8 +18,8 @@ from cloudrc.link.profile import PERIOD_KEYS
 
 CHANGEABLE_KEYS = ChangeConfig.model_fields.keys() - {"at_s"}
 """Keys of a direction that an entry of its list `changes` may set."""
-TIME_LINE_KEYS = ("changes", "trace", "blackouts", "rate_trace", "loop", "repeat_s")
-"""Keys of a direction that make up its time line: how the link's conditions change over time."""
+SCHEDULE_KEYS = ("changes", "trace", "blackouts", "rate_trace", "loop", "repeat_s")
+"""Keys of a direction that make up its schedule: how the link's conditions change over time."""
 _SETTING = "downlink.delay_ms=120"
 _EXAMPLE = f"for example {_SETTING}, or --profile handover"
 
@@ -29,7 +29,7 @@ class Edit(NamedTuple):
 
     values: dict[str, Any]  # as in a profile file, without defaults; paths are absolute
     cause: str  # the request in words
-    restart: bool  # whether the time line starts again when the profile takes effect
+    restart: bool  # whether the schedule starts again when the profile takes effect
     notes: list[str]  # sentences for the user about side effects
 
 
@@ -63,8 +63,8 @@ def edit_profile(
         if not keys or way not in DIRECTIONS:
             raise BadInputError(f"{'.'.join(path)}: set a key of uplink or downlink, {_EXAMPLE}")
         changes[way, *keys] = setting
-        restart |= keys[0] in TIME_LINE_KEYS
-        notes += _drop_from_time_line(document, way, keys[0])
+        restart |= keys[0] in SCHEDULE_KEYS
+        notes += _drop_from_schedule(document, way, keys[0])
     overrides.apply_overrides(document, changes)
     new_profile = check_profile(document, command)
     for way in DIRECTIONS:
@@ -74,14 +74,14 @@ def edit_profile(
     return Edit(values, ", ".join([*words, *settings]), restart, notes)
 
 
-def _drop_from_time_line(document: Document, way: str, key: str) -> list[str]:
+def _drop_from_schedule(document: Document, way: str, key: str) -> list[str]:
     """Remove what changes `key` over time in the direction `way`; return notes for the user."""
     direction = document.get(way)
     if not isinstance(direction, dict) or key not in CHANGEABLE_KEYS:
         return []
     notes = []
     if [entry for entry in direction.get("changes") or () if entry.pop(key, None) is not None]:
-        notes.append(f"the time line of the {way} no longer changes {key}")
+        notes.append(f"the schedule of the {way} no longer changes {key}")
     if key == "delay_ms" and direction.pop("trace", None) is not None:
         notes.append(f"the {way} no longer follows its trace")
         if not any(direction.get(each) for each in PERIOD_KEYS):

@@ -196,7 +196,7 @@ class ResolvedExperiment(Experiment):
         return self._acting("downlink")
 
     def _acting(self, name: str) -> DirectionConfig:
-        """Return a direction with its faults; its time line goes round if it begins at random."""
+        """Return a direction with its faults; its schedule repeats if it begins at random."""
         way: DirectionConfig = getattr(self.link, name)
         if self.link.start_s == RANDOM:
             return way.model_copy(update={"loop": True}) if way.may_repeat else way

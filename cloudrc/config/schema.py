@@ -325,8 +325,8 @@ class Link(Section):
     downlink: DirectionConfig = DirectionConfig()
     """Conditions from cloud to world; a key here overrides the profile"""
     start_s: StartConfig | None = None
-    """Where in the time line of the link the flight begins [s], or random: drawn from the seed, and
-    the line goes round. null: the profile's value, else 0"""
+    """Where in the schedule of the link the flight begins [s], or random: drawn from the seed, and
+    the schedule repeats. null: the profile's value, else 0"""
 
     _write = leave_out_unset("start_s")
 

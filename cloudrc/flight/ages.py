@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.config.time_line import find_ways
+from cloudrc.config.link_schedule import find_ways
 from cloudrc.flight.assembly import build_compute_time
 from cloudrc.link.draws import BLOCK, OVERTAKES, impairments, stream_key
 from cloudrc.link.model import LinkDirection

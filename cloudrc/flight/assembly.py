@@ -32,11 +32,11 @@ from cloudrc.cloud.perceiving import Here, Perceiver
 from cloudrc.cloud.planar import Planar
 from cloudrc.config import schema
 from cloudrc.config.faults import CLOUD_KILLED, CLOUD_PAUSED, WORLD_PAUSED, acting
+from cloudrc.config.link_schedule import find_ways
 from cloudrc.config.mission_check import start_of
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
-from cloudrc.config.time_line import find_ways
 from cloudrc.flight.drivers.channels import find_channel
 from cloudrc.flight.legs import LEG_FACTOR, leg_to, step_legs
 from cloudrc.flight.sensing import build_film, build_receiver, build_scanner, build_target

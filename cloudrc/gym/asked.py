@@ -2,8 +2,8 @@
 
 """Compute what a link asks for: the mean delay and the loss of messages.
 
-Over a time line, it is that of the part which an episode meets. Without a rate, packets are the
-mean of the pieces of the time line by their time. With one, packets act on those behind them, so
+Over a schedule, it is that of the part which an episode meets. Without a rate, packets are the
+mean of the pieces of the schedule by their time. With one, packets act on those behind them, so
 the numbers of each piece come from the model, as do those of larger messages and of streams.
 """
 
@@ -24,7 +24,7 @@ from cloudrc.link.profile import (
     Conditions,
     DirectionProfile,
     GilbertElliott,
-    Timeline,
+    LinkSchedule,
     mean_loss,
     whole_share,
 )
@@ -32,18 +32,18 @@ from cloudrc.link.queue import NOTHING_NS
 from cloudrc.link.streams import sample
 
 PACKETS = 10_000
-"""Least number of packets that the model sends over a time line, and most messages for a mean."""
+"""Least number of packets that the model sends over a schedule, and most messages for a mean."""
 PIECES, MESSAGES_MIN = 50_000, 200
 """Number of packets of larger messages that the model sends, and the least number of messages."""
 SETTLED_NS = 100_000_000_000
 """Time after which what is still repaired counts as lost [ns]."""
 SETTLED = 1_000
-"""Number of packets that it sends after the last change of a time line that ends."""
+"""Number of packets that it sends after the last change of a schedule that ends."""
 _GRID = 1_000  # number of quantiles of a distribution
 
 
 class Met(NamedTuple):
-    """The part of a time line that an episode meets."""
+    """The part of a schedule that an episode meets."""
 
     start_ns: int
     duration_ns: int
@@ -71,7 +71,7 @@ class AskedOfWire:
 @lru_cache(maxsize=64)
 def _parts_of(wire: Wire, period: float) -> PartsAsked | None:
     """Return what a wire asks for over time; None if it is always the same."""
-    return PartsAsked(wire, period) if Timeline(wire.profile).only() is None else None
+    return PartsAsked(wire, period) if LinkSchedule(wire.profile).only() is None else None
 
 
 @lru_cache(maxsize=64)
@@ -90,7 +90,7 @@ def expected(wire: Wire, period: float, count: int = 0) -> tuple[float, float]:
     came = delays[np.isfinite(delays)]
     loss = 1.0 - len(came) / len(delays)
     is_simple = wire.delivery == DATAGRAMS and isnan(wire.occupies)
-    only = Timeline(profile).only() if is_simple else None
+    only = LinkSchedule(profile).only() if is_simple else None
     if only is not None and not only.blackout:
         loss = 1.0 - (1.0 - profile.corrupt) ** pieces * whole_share(only.loss, pieces)
     return float(came.mean()) if len(came) else nan, loss
@@ -123,12 +123,12 @@ class PartsAsked:
 
     def __init__(self, wire: Wire, period: float) -> None:
         """Take messages, one per `period` [s]."""
-        self._timeline = timeline = Timeline(wire.profile)
-        self._edges_ns = np.array(timeline.pass_ns, dtype=float)
-        if wire.is_plain and not _is_coupled(wire.profile, timeline):
-            means = _exactly(wire.profile, timeline)
+        self._schedule = schedule = LinkSchedule(wire.profile)
+        self._edges_ns = np.array(schedule.pass_ns, dtype=float)
+        if wire.is_plain and not _is_coupled(wire.profile, schedule):
+            means = _exactly(wire.profile, schedule)
         else:
-            means = _by_model(wire, timeline, period)
+            means = _by_model(wire, schedule, period)
         delays, losses = means.T
         # Rows: lost, arrived, and arrived times delay; per time.
         self._rates = np.stack([losses, 1.0 - losses, (1.0 - losses) * np.nan_to_num(delays)])
@@ -136,8 +136,8 @@ class PartsAsked:
         before = np.cumsum(self._rates[:, :-1] * spans, axis=1)
         self._sums = np.concatenate([np.zeros((3, 1)), before], axis=1)
         self._of_period = np.zeros(3)
-        if timeline.period_ns is not None:
-            rest_ns = timeline.period_ns - self._edges_ns[-1]
+        if schedule.period_ns is not None:
+            rest_ns = schedule.period_ns - self._edges_ns[-1]
             self._of_period = self._sums[:, -1] + self._rates[:, -1] * rest_ns
 
     def of(self, met: Met) -> tuple[float, float]:
@@ -147,8 +147,8 @@ class PartsAsked:
         return delayed / arrived if arrived > 0.0 else nan, lost / (lost + arrived)
 
     def _until(self, time_ns: int) -> Floats:
-        """Return the sums from the beginning of the time line to a time [ns], shape (3,)."""
-        passes, period_ns = 0, self._timeline.period_ns
+        """Return the sums from the beginning of the schedule to a time [ns], shape (3,)."""
+        passes, period_ns = 0, self._schedule.period_ns
         if period_ns is not None:
             passes, time_ns = divmod(time_ns, period_ns)
         place = int(np.searchsorted(self._edges_ns, time_ns, side="right")) - 1
@@ -157,17 +157,17 @@ class PartsAsked:
         return found + passes * self._of_period
 
 
-def _is_coupled(profile: DirectionProfile, timeline: Timeline) -> bool:
+def _is_coupled(profile: DirectionProfile, schedule: LinkSchedule) -> bool:
     """Return whether the delay of a packet depends on its time, or on those before it."""
-    has_rate = profile.opportunities or any(each.rate is not None for each in timeline.pieces)
+    has_rate = profile.opportunities or any(each.rate is not None for each in schedule.pieces)
     if profile.radio:
         return True
-    return bool(has_rate) or (profile.keep_order and any(each.jitter for each in timeline.pieces))
+    return bool(has_rate) or (profile.keep_order and any(each.jitter for each in schedule.pieces))
 
 
-def _exactly(profile: DirectionProfile, timeline: Timeline) -> Floats:
+def _exactly(profile: DirectionProfile, schedule: LinkSchedule) -> Floats:
     """Return mean delay [s] and loss of packets in each piece, shape (n, 2)."""
-    return np.array([_means(profile, each) for each in timeline.pieces])
+    return np.array([_means(profile, each) for each in schedule.pieces])
 
 
 def _means(profile: DirectionProfile, each: Conditions) -> tuple[float, float]:
@@ -205,19 +205,19 @@ def _shape(distribution: str) -> tuple[float, ...]:
     return tuple(((values - values.mean()) / values.std()).tolist())
 
 
-def _by_model(wire: Wire, timeline: Timeline, period: float) -> Floats:
+def _by_model(wire: Wire, schedule: LinkSchedule, period: float) -> Floats:
     """Return mean delay [s] and loss in each piece, of messages that are sent through the model."""
-    period_ns, pass_ns = round(period * 1e9), timeline.period_ns
+    period_ns, pass_ns = round(period * 1e9), schedule.period_ns
     least = PACKETS if wire.is_plain else _messages(wire.cut.usual)
-    count = (pass_ns or timeline.pass_ns[-1] + SETTLED * period_ns) // period_ns + 1
+    count = (pass_ns or schedule.pass_ns[-1] + SETTLED * period_ns) // period_ns + 1
     passes = -(-least // count)
     if pass_ns is not None:  # the packets go on from one pass to the next
         count, passes = count * passes, 1
     sent_ns = np.arange(count) * period_ns
     every = np.concatenate([_delays_of(wire, sent_ns.tolist(), each) for each in range(passes)])
     time_ns = sent_ns if pass_ns is None else sent_ns % pass_ns
-    place = np.tile(np.searchsorted(timeline.pass_ns, time_ns, side="right") - 1, passes)
-    found = _exactly(wire.profile, timeline)
+    place = np.tile(np.searchsorted(schedule.pass_ns, time_ns, side="right") - 1, passes)
+    found = _exactly(wire.profile, schedule)
     for n in np.unique(place):
         own = every[place == n]
         came = own[np.isfinite(own)]

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from cloudrc.gym.lane import DATAGRAMS, Wire
-from cloudrc.link.profile import Timeline, whole_share
+from cloudrc.link.profile import LinkSchedule, whole_share
 
 
 class LinkWarning(UserWarning):
@@ -32,7 +32,7 @@ def _name(wire: Wire) -> str:
 
 def _describe_loss(wire: Wire) -> Iterator[str]:
     count, queue, shares = wire.cut.usual, wire.profile.queue_packets, list[float]()
-    pieces = [piece for piece in Timeline(wire.profile).pieces if not piece.blackout]
+    pieces = [piece for piece in LinkSchedule(wire.profile).pieces if not piece.blackout]
     for piece in pieces:
         intact = (1.0 - wire.profile.corrupt) ** count
         overflows = bool(wire.rates) and queue < count

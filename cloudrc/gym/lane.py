@@ -13,7 +13,7 @@ from cloudrc.link.carry.tcp.stream import MessageStream, run_due
 from cloudrc.link.library import KIND, Cut, LinkProfile, OneWay
 from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.opportunities import BYTES as OPPORTUNITY_BYTES
-from cloudrc.link.profile import DirectionProfile, Timeline
+from cloudrc.link.profile import DirectionProfile, LinkSchedule
 from cloudrc.link.queue import PacketQueue
 
 DATAGRAMS, STREAM = "datagrams", "stream"
@@ -61,7 +61,7 @@ class Wire(NamedTuple):
         times_ns = self.profile.opportunities
         if times_ns:
             return (len(times_ns) * 8.0 * OPPORTUNITY_BYTES / (times_ns[-1] * 1e-9),)
-        return tuple(piece.rate for piece in Timeline(self.profile).pieces if piece.rate)
+        return tuple(piece.rate for piece in LinkSchedule(self.profile).pieces if piece.rate)
 
     @property
     def occupies(self) -> float:
@@ -87,7 +87,7 @@ class Lane:
     ) -> None:
         """Send over a link with its `seed` and its name, `stream`.
 
-        `start` returns where in the time line of the link an episode begins [ns]; None: at 0.
+        `start` returns where in the schedule of the link an episode begins [ns]; None: at 0.
         """
         self.wire, self._seed, self._name, self._start = wire, seed, stream, start
         self._way = OneWay(wire.profile, seed, wire.uplink, stream=stream, start=start)

@@ -69,7 +69,7 @@ def _draw_one(every: Sequence[Chosen], seed: int, own: int, episode: int, stream
 def read(link: Profile, name: str) -> Chosen:
     """Read a link; `name` is that of one which is neither a name nor a file.
 
-    Its time line, if it has a period, begins at random, unless the profile says where.
+    Its schedule, if it has a period, begins at random, unless the profile says where.
     """
     profile = read_profile(link)
     if profile.start_s is None and profile.period_ns:

@@ -46,14 +46,14 @@ class Loaded(NamedTuple):
     direction: DirectionProfile  # profile of the direction that this process shapes, in SI units
     values: dict[str, Any]  # content of the file, without defaults, to show to users
     change: ChangeFacts = ChangeFacts()  # the last change of the profile: its number and cause
-    start_ns: int = 0  # where the time line begins [ns]
+    start_ns: int = 0  # where the schedule begins [ns]
     note: str = ""  # says so in words; "" at its beginning
 
 
 def load_way(
     keys: ProfileKeys, way: str, values: dict[str, Any], seed: int, stream: str = ""
 ) -> Loaded:
-    """Read the files of a profile; return its direction `way`, and where its time line begins.
+    """Read the files of a profile; return its direction `way`, and where its schedule begins.
 
     `values` are the content of the profile's file. The start depends on `seed` and `stream`.
     """

@@ -104,10 +104,10 @@ class LinkProfile:
 
     uplink: DirectionProfile
     downlink: DirectionProfile
-    start_s: Start | None = None  # where an episode begins in the time line [s], or random; None: 0
+    start_s: Start | None = None  # where an episode begins in the schedule [s], or random; None: 0
 
     def __post_init__(self) -> None:
-        if self.start_s == RANDOM:  # then time lines go round
+        if self.start_s == RANDOM:  # then schedules repeat
             for way in DIRECTIONS:
                 object.__setattr__(self, way, going_round(getattr(self, way)))
 
@@ -117,10 +117,10 @@ class LinkProfile:
         return max(way.period_ns or 0 for way in (self.uplink, self.downlink))
 
     def start_ns(self, seed: int, episode: int, stream: str = "") -> int:
-        """Return where in its time line an episode begins [ns], equal for both directions."""
+        """Return where in its schedule an episode begins [ns], equal for both directions."""
         if self.start_s is None:
             return 0
-        from cloudrc.link.start import start_ns  # here: few links have a time line
+        from cloudrc.link.start import start_ns  # here: few links have a schedule
 
         return start_ns((self.uplink, self.downlink), self.start_s, seed, episode, stream)
 
@@ -186,7 +186,7 @@ class OneWay:
     ) -> None:
         """Open a direction; `seed` and `stream` are those of `cloudrc.link.open`.
 
-        `start` returns where in its time line an episode begins [ns]; without it, at 0.
+        `start` returns where in its schedule an episode begins [ns]; without it, at 0.
         """
         with naming("seed"):
             self._seed = SEED.of(seed)
@@ -311,7 +311,7 @@ class OneWay:
         """Compute what the profile asks for: statistics of 10,000 packets from the model.
 
         The random numbers are not those of the episodes. The packets leave once per `period` [s]
-        from the start of the time line on and have `size` bytes. They meet many phases of a radio
+        from the start of the schedule on and have `size` bytes. They meet many phases of a radio
         whose phase is random.
         """
         from cloudrc.link.streams import numbers, sample

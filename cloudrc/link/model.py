@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, TypeAlias
 
 from cloudrc.link.draws import BLOCK, OVERTAKES, Fate, bit_flips, impairments, stream_key
-from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
+from cloudrc.link.profile import Conditions, DirectionProfile, LinkSchedule, Loss
 
 if TYPE_CHECKING:
     from cloudrc.link.radio import RadioParts, Slots
@@ -77,7 +77,7 @@ class LinkDirection:
     ) -> None:
         """Create the model; `uplink` is True for world to cloud.
 
-        `origin_ns` is the start of the time line [ns], on the clock of `now_ns` in `send`. Links
+        `origin_ns` is the start of the schedule [ns], on the clock of `now_ns` in `send`. Links
         with one seed and different names, `stream`, have different random numbers.
         """
         self._seed, self._uplink, self._stream = seed, uplink, stream
@@ -96,14 +96,14 @@ class LinkDirection:
 
         Seed and the bottleneck's queue are kept. The random impairments are the same as if
         the link had used this profile from the start. With `restart`, the next packet is at
-        `start_ns` of the new time line; otherwise it starts at the same time as the old time line.
+        `start_ns` of the new schedule; otherwise it starts at the same time as the old schedule.
         """
         if restart:
             self._origin_ns, self._start_ns = None, start_ns
         self.corrupts = profile.corrupt > 0.0
         self._profile = profile
-        self._timeline = Timeline(profile)
-        self._only = self._timeline.only()
+        self._schedule = LinkSchedule(profile)
+        self._only = self._schedule.only()
         times_ns, self._opportunities = profile.opportunities, None
         if times_ns:
             from cloudrc.link.opportunities import Opportunities  # here: few links need it
@@ -111,10 +111,10 @@ class LinkDirection:
             self._opportunities = Opportunities(times_ns)
         self._radio: Slots | None = None
         if profile.radio:
-            from cloudrc.link.radio import schedule
+            from cloudrc.link.radio import slots_of
 
-            self._radio = schedule(profile.radio, self._uplink)
-        has_rate = times_ns or any(p.rate is not None for p in self._timeline.pieces)
+            self._radio = slots_of(profile.radio, self._uplink)
+        has_rate = times_ns or any(p.rate is not None for p in self._schedule.pieces)
         self._plain = not profile.keep_order and not has_rate and not profile.radio
         self._fates: dict[tuple[int, int, int, float, Loss], list[Fate]] = {}
         self._place: tuple[int, int, int, Conditions] | None = None
@@ -139,7 +139,7 @@ class LinkDirection:
         """
         if self._origin_ns is None:
             self._origin_ns = now_ns - self._start_ns
-        conditions = self._only or self._timeline.at(now_ns - self._origin_ns)
+        conditions = self._only or self._schedule.at(now_ns - self._origin_ns)
         if conditions.blackout:
             self.blackouts += 1
             return ()
@@ -201,7 +201,7 @@ class LinkDirection:
         least = -profile.quantiles[0] if profile.quantiles else 0.0
         spread = {"uniform": 1.0, "normal": 9.0, "pareto": 0.7, "table": least}
         below = spread[profile.distribution] * 1e9
-        delays = (piece.delay_ns - below * piece.jitter for piece in self._timeline.pieces)
+        delays = (piece.delay_ns - below * piece.jitter for piece in self._schedule.pieces)
         air_ns = self._radio.span.least if self._radio else 0
         return 0 if profile.reorder else max(0, int(min(delays)) - 1) + air_ns
 

@@ -34,13 +34,13 @@ import numpy as np
 from cloudrc.base.errors import CloudrcError, MissingPrerequisiteError, RejectedError
 from cloudrc.link.carry.udp import Address
 from cloudrc.link.draws import PARETO_CUT, Floats
-from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
+from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, LinkSchedule, Loss
 
 USE_RELAY = "use the relay (link.mode=relay, or --shaper relay)"
 UNDO = "stop that program, and restart this pod"
 ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"  # root qdisc, band of the tunnel, its netem
 PERIOD_NS = 1_000_000_000  # time between two checks of the qdiscs [ns]
-STEP_NS = 5_000_000  # shortest time between two changes by a time line; faster are skipped [ns]
+STEP_NS = 5_000_000  # shortest time between two changes by a schedule; faster are skipped [ns]
 LIMIT = 10_000  # largest number of packets in a qdisc without a bottleneck, as in the relay
 DELAY_MAX_MS = 274_000  # longest delay that tc accepts [ms]: 2^32 ticks of 64 ns
 ENTRIES = 4096  # number of entries in a table of a delay distribution
@@ -168,9 +168,9 @@ def write_table(folder: Path, profile: DirectionProfile) -> None:
 
 def check(profile: DirectionProfile) -> None:
     """Raise a RejectedError with the reason if netem cannot realise a profile."""
-    pieces = Timeline(profile).pieces
+    pieces = LinkSchedule(profile).pieces
     beyond = {
-        "a time line that goes round (loop, or start_s: random)": profile.loop,
+        "a schedule that repeats (loop, or start_s: random)": profile.loop,
         "rate_trace": bool(profile.opportunities),
         "radio (slots, requests and grants)": profile.radio is not None,
         "loss.delay_bad_ms (more delay while a burst of losses lasts)": any(
@@ -215,10 +215,10 @@ def options(profile: DirectionProfile, conditions: Conditions, room: int) -> lis
 def limit(profile: DirectionProfile) -> int:
     """Return the limit of the qdisc [packets]: packets under way plus the bottleneck's queue.
 
-    The limit is constant along a time line: when the delay becomes shorter, packets that are under
+    The limit is constant along a schedule: when the delay becomes shorter, packets that are under
     way with the longer delay must not be dropped.
     """
-    pieces = Timeline(profile).pieces
+    pieces = LinkSchedule(profile).pieces
     if all(piece.rate is None for piece in pieces):
         return LIMIT
     reach = stretch(profile) * _END_OF_TABLE
@@ -291,10 +291,10 @@ class Netem:
         self._take(profile, origin_ns)
 
     def _take(self, profile: DirectionProfile, origin_ns: int) -> None:
-        self._profile, self._timeline = profile, Timeline(profile)
+        self._profile, self._schedule = profile, LinkSchedule(profile)
         self._origin_ns, self._piece = origin_ns, -1
         self._room = self._least_room = limit(profile)
-        if any(piece.jitter for piece in self._timeline.pieces):
+        if any(piece.jitter for piece in self._schedule.pieces):
             write_table(self._tables, profile)
 
     def follow_peer(self, peer: Address) -> Address:
@@ -323,9 +323,9 @@ class Netem:
     def follow_profile(
         self, profile: DirectionProfile, *, restart: bool = False, start_ns: int = 0
     ) -> None:
-        """Use this profile from now on; with `restart`, its time line is at `start_ns` now.
+        """Use this profile from now on; with `restart`, its schedule is at `start_ns` now.
 
-        Without `restart`, the new time line keeps the start time of the old one. Datagrams
+        Without `restart`, the new schedule keeps the start time of the old one. Datagrams
         in flight are not lost. If netem cannot realise the profile, the method raises a
         CloudrcError and the old profile stays in force.
         """
@@ -345,7 +345,7 @@ class Netem:
             raise
 
     def step(self, timeout: float) -> None:
-        """Make the changes of the time line that are due within the next `timeout` [s]."""
+        """Make the changes of the schedule that are due within the next `timeout` [s]."""
         until_ns = self._clock() + round(timeout * 1e9)
         if self._clock() - self._looked_ns >= PERIOD_NS:
             # Restore the limit when packets from before the change have left.
@@ -364,7 +364,7 @@ class Netem:
         The datagrams are `forwarded` (including copies), `lost` (dropped at random or because the
         queue was full) and `held` (in the queue now); without the qdisc, these counters are absent.
         `step_lateness_p50_ns` and `step_lateness_p99_ns` are percentiles [ns] of how late the qdisc
-        followed the changes of the time line. `restored` is the number of times that another
+        followed the changes of the schedule. `restored` is the number of times that another
         program removed or changed the qdiscs; despite the name, `Netem` does not restore them.
         """
         found = self._look() | {"restored": self._damages}
@@ -426,15 +426,15 @@ class Netem:
                 raise
 
     def _apply(self, verb: str) -> None:
-        """Run tc's `verb` ("add" or "change") if the conditions of the time line have changed."""
-        elapsed_ns, starts_ns = self._clock() - self._origin_ns, self._timeline.pass_ns
+        """Run tc's `verb` ("add" or "change") if the conditions of the schedule have changed."""
+        elapsed_ns, starts_ns = self._clock() - self._origin_ns, self._schedule.pass_ns
         before, self._piece = self._piece, max(bisect_right(starts_ns, elapsed_ns) - 1, 0)
-        wanted = options(self._profile, self._timeline.pieces[self._piece], self._room)
+        wanted = options(self._profile, self._schedule.pieces[self._piece], self._room)
         if wanted != self._applied:
             place = ("dev", self._device, "parent", BAND, "handle", LEAF)
             self._run(("tc", "qdisc", verb, *place, "netem", *wanted))
             self._applied, self._listed = wanted, None
-        if 0 <= before < self._piece:  # the first piece of a time line is no change
+        if 0 <= before < self._piece:  # the first piece of a schedule is no change
             self._stepped_ns = self._clock()
             due_ns = self._origin_ns + starts_ns[self._piece]
             self._lateness_ns.append(self._stepped_ns - due_ns)
@@ -442,9 +442,9 @@ class Netem:
     def _next_ns(self) -> float:
         """Return when the next change is due [ns]; infinite after the last change."""
         following = self._piece + 1
-        if following >= len(self._timeline.pass_ns):
+        if following >= len(self._schedule.pass_ns):
             return inf
-        due_ns = self._origin_ns + self._timeline.pass_ns[following]
+        due_ns = self._origin_ns + self._schedule.pass_ns[following]
         return max(due_ns, self._stepped_ns + STEP_NS)
 
     def _select(self, peer: Address) -> None:

@@ -31,7 +31,7 @@ class Opportunities:
         self._left = 0  # what may still leave there [bytes]
 
     def leave_ns(self, size: int, now_ns: int) -> int:
-        """Return when a packet of `size` bytes leaves that arrives at `now_ns` of the time line."""
+        """Return when a packet of `size` bytes leaves that arrives at `now_ns` of the schedule."""
         passes, rest_ns = divmod(now_ns, self._period_ns)
         first = passes * len(self._times_ns) + bisect_left(self._times_ns, rest_ns)
         if first > self._place:

@@ -30,15 +30,15 @@ CLOUD_TIME_MAX = 10
 CloudTime = Annotated[float, Quantity(gt=0, le=CLOUD_TIME_MAX)]
 DIRECTIONS = ("uplink", "downlink")
 RANDOM: Final = "random"
-"""Start of a time line that is drawn from seed, episode and stream."""
+"""Start of a schedule that is drawn from seed, episode and stream."""
 Start = NotNegative | Literal["random"]
-"""Where a time line begins: a time [s], or `RANDOM`."""
+"""Where a schedule begins: a time [s], or `RANDOM`."""
 
 
 PHASE_PACKETS = 10
 """Number of packets that a simulation sends at each of many random phases of a radio."""
 PERIOD_KEYS = ("repeat_s", "trace", "rate_trace")
-"""Keys of a direction that give its time line a period."""
+"""Keys of a direction that give its schedule a period."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Radio:
     repeat_ms: NotNegative = 5.0
     """Time that each repetition adds [ms]"""
     phase_ms: Start = 0.0
-    """Time of the radio when the time line of the link is at 0 [ms], or random: drawn from seed,
+    """Time of the radio when the schedule of the link is at 0 [ms], or random: drawn from seed,
     stream, direction and episode"""
     drift_ppm: Annotated[float, Quantity(ge=-1e5, le=1e5)] = 0.0
     """How much faster the clock of the radio is than that of the sender [1e-6]"""
@@ -181,7 +181,7 @@ class DirectionKeys:
     loop: bool = False
     """Whether trace, changes and blackouts begin again after a period; netem refuses true"""
     repeat_s: Positive | None = None
-    """Period of the time line [s], with loop and with start_s: random; null: that of the trace"""
+    """Period of the schedule [s], with loop and with start_s: random; null: that of the trace"""
     blackouts: tuple[Blackout, ...] = ()
     """Intervals in which every packet is lost; they may overlap"""
 
@@ -202,7 +202,7 @@ class DirectionKeys:
 
     @property
     def may_repeat(self) -> bool:
-        """Whether a key gives the time line a period."""
+        """Whether a key gives the schedule a period."""
         return any(getattr(self, key) for key in PERIOD_KEYS)
 
 
@@ -217,8 +217,8 @@ class ProfileKeys:
     downlink: DirectionKeys = DirectionKeys()
     """Conditions from cloud to world"""
     start_s: Start | None = None
-    """Where in the time line of both directions an episode or flight begins [s], or random: then
-    the line goes round. null: 0; of episodes random, if the line has a period"""
+    """Where in the schedule of both directions an episode or flight begins [s], or random: then
+    the schedule repeats. null: 0; of episodes random, if it has a period"""
     command_age_max_ms: CommandAge | None = None
     """Default of guard.command_age_max_ms with this profile [ms]; null: 250"""
     horizon_max_s: CloudTime | None = None
@@ -231,19 +231,19 @@ class ProfileKeys:
         return refuse_start(self.start_s, self.uplink, self.downlink)
 
 
-NO_PERIOD = "the time line has no period; give repeat_s, its period in s"
-"""Why a time line cannot go round."""
+NO_PERIOD = "the schedule has no period; give repeat_s, its period in s"
+"""Why a schedule cannot repeat."""
 
 
 def refuse_start(start: Start | None, *ways: DirectionKeys) -> str:
-    """Say why a time line cannot begin at `start`; "" if it can."""
+    """Say why a schedule cannot begin at `start`; "" if it can."""
     if start == RANDOM and not any(way.may_repeat for way in ways):
         return f"start_s: random: {NO_PERIOD}"
     return ""
 
 
 def refuse_period(period: float | None, last: float) -> str:
-    """Say why a time line whose last part is at `last` cannot have a period [s]; "" if it can."""
+    """Say why a schedule whose last part is at `last` cannot have a period [s]; "" if it can."""
     if period is None or period >= last:
         return ""
     return f"repeat_s: {period:g} s ends before the last entry, at {last:g} s; give a longer time"
@@ -277,7 +277,7 @@ class Trace:
     The delays replace the profile's `delay_ms`; the profile's jitter is added to them. If the trace
     has losses, they replace the profile's `loss`. The first row also applies before its time.
 
-    The last row applies forever. If the time line goes round and gives no other period, the last
+    The last row applies forever. If the schedule repeats and gives no other period, the last
     row lasts as long as the other rows on average.
     """
 
@@ -312,7 +312,7 @@ class DirectionProfile(DirectionKeys):
 
     @property
     def period_ns(self) -> int | None:
-        """Period of the time line [ns]; None if it has none."""
+        """Period of the schedule [ns]; None if it has none."""
         period = self.repeat_s
         if period is None and self.rows is not None:
             period = self.rows.period
@@ -328,12 +328,12 @@ class DirectionProfile(DirectionKeys):
 
 
 def going_round(profile: DirectionProfile) -> DirectionProfile:
-    """Return a direction whose time line begins again after its period, if it has one."""
+    """Return a direction whose schedule begins again after its period, if it has one."""
     return profile if profile.period_ns is None else replace(profile, loop=True)
 
 
 class Conditions(NamedTuple):
-    """The constant conditions during one piece of a time line."""
+    """The constant conditions during one piece of a schedule."""
 
     delay_ns: int  # mean one-way delay [ns]
     jitter: float  # [s]
@@ -342,14 +342,14 @@ class Conditions(NamedTuple):
     blackout: bool
 
 
-class Timeline:
+class LinkSchedule:
     """The conditions of one direction over time, from its changes, trace and blackouts.
 
     Attributes:
-        pieces: The conditions in each piece of the time line, constant within the piece. If the
-            time line loops, the pieces are those of one period.
+        pieces: The conditions in each piece of the schedule, constant within the piece. If the
+            schedule loops, the pieces are those of one period.
         pass_ns: Start of each piece [ns], rising; 0 is the time at which the link came up.
-        period_ns: Period of a looping time line [ns]; None if the time line does not loop.
+        period_ns: Period of a looping schedule [ns]; None if the schedule does not loop.
     """
 
     def __init__(self, profile: DirectionProfile) -> None:
@@ -373,8 +373,8 @@ class Timeline:
 
 
 def settled(profile: DirectionProfile) -> DirectionProfile:
-    """Return the profile with constant conditions: those of the last piece of its time line."""
-    last = Timeline(profile).pieces[-1]
+    """Return the profile with constant conditions: those of the last piece of its schedule."""
+    last = LinkSchedule(profile).pieces[-1]
     return replace(
         profile,
         delay_ms=last.delay_ns * 1e-6,
@@ -391,7 +391,7 @@ def settled(profile: DirectionProfile) -> DirectionProfile:
 
 @lru_cache(maxsize=8)  # of a few links; of a trace with millions of rows it takes long
 def _lay_out(profile: DirectionProfile) -> tuple[list[int], list[Conditions], int | None]:
-    """Return what `Timeline` has: `pass_ns`, `pieces` and `period_ns`; nobody changes the lists."""
+    """Return of a `LinkSchedule` `pass_ns`, `pieces`, `period_ns`; the lists stay as they are."""
     instants = {0.0, *(change.at_s for change in profile.changes)}
     instants.update(profile.rows.times if profile.rows else ())
     for blackout in profile.blackouts:
@@ -436,13 +436,13 @@ def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
 
 
 def summary(profile: DirectionProfile, radio: float = 0.0) -> dict[str, float | None]:
-    """Summarise a direction's conditions at the start of its time line.
+    """Summarise a direction's conditions at the start of its schedule.
 
     Returns:
         `delay` and `jitter` [s]; `loss`, the long-run share in [0, 1]; and `rate` [bit/s], which is
         None without a bottleneck. The delay includes `radio`, that in a radio [s].
     """
-    first = Timeline(profile).at(0)
+    first = LinkSchedule(profile).at(0)
     loss = 1.0 if first.blackout else mean_loss(first.loss)
     delay = round(first.delay_ns * 1e-9 + radio, 9)
     return {"delay": delay, "jitter": first.jitter, "loss": loss, "rate": first.rate}

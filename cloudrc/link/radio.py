@@ -80,8 +80,8 @@ class Slots:
     def split(self, sent_ns: int, phase_ns: int, repeats: int) -> RadioParts:
         """Split the delay of a packet that is sent at `sent_ns` into its parts.
 
-        `sent_ns` is the time on the time line of the link [ns], `phase_ns` that of the radio when
-        the time line is at 0 [ns]; `repeats` is how often the packet is sent again.
+        `sent_ns` is the time on the schedule of the link [ns], `phase_ns` that of the radio when
+        the schedule is at 0 [ns]; `repeats` is how often the packet is sent again.
         """
         now_ns = asks_ns = ready_ns = sent_ns + round(sent_ns * self._drift) + phase_ns
         if self._request_ns:
@@ -101,17 +101,17 @@ def mean_delay(profile: DirectionProfile, uplink: bool) -> float:
     """Return the mean delay in the radio at random phases, with repetitions [s]; 0 without one."""
     if profile.radio is None:
         return 0.0
-    found = schedule(profile.radio, uplink)
+    found = slots_of(profile.radio, uplink)
     return (found.span.mean + found.repeats_ns) * 1e-9
 
 
-schedule = lru_cache(maxsize=64)(Slots)
+slots_of = lru_cache(maxsize=64)(Slots)
 """Make `Slots`; of equal arguments, the same."""
 
 
 @lru_cache(maxsize=64)
 def phase_ns(radio: Radio, seed: int, uplink: bool, epoch: int, stream: str) -> int:
-    """Return the time of the radio when the time line of the link is at 0 [ns]."""
+    """Return the time of the radio when the schedule of the link is at 0 [ns]."""
     if not isinstance(radio.phase_ms, str):
         return round(radio.phase_ms * 1e6)
     period_ns = lcm(radio.pattern_ns, round(radio.request_ms * 1e6)) or radio.pattern_ns

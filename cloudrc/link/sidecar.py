@@ -33,7 +33,7 @@ STEP = 0.05  # longest time until `run` reacts to a new peer or profile [s]
 Shaper: TypeAlias = "Relay | Netem"
 """Shapes the datagrams that the own end of the tunnel sends."""
 Make = Callable[[DirectionProfile, int], Shaper]
-"""Function that makes a shaper from a profile and the monotonic start of its time line [ns]."""
+"""Function that makes a shaper from a profile and the monotonic start of its schedule [ns]."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -55,7 +55,7 @@ class Sidecar:
     route: Path  # file with the address to which the tunnel sends; the state is beside it
     tell: Callable[[LinkState], object]  # exports each new state of the link as metrics
     count: Callable[[dict[str, int]], object]  # exports datagrams by outcome, once a second
-    origin_ns: int = 0  # when the link comes up, then time 0 of its time line [ns]; 0: not yet
+    origin_ns: int = 0  # when the link comes up, then time 0 of its schedule [ns]; 0: not yet
     peer: Address | None = None  # address of the other end
     state: LinkState | None = None  # last state that is published
     _reason: str = ""  # why this shaper was chosen, in words

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Find where in its time line a link begins: at a given time, or at one drawn at random.
+"""Find where in its schedule a link begins: at a given time, or at one drawn at random.
 
 Both directions begin at the same time. The draw depends on seed, episode and stream alone, so what
-has these three equal meets the same part of the time line.
+has these three equal meets the same part of the schedule.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ def begin(
     episode: int = 0,
     stream: str = "",
 ) -> tuple[DirectionProfile, DirectionProfile, int]:
-    """Return uplink and downlink with the time lines they have, and where these begin [ns].
+    """Return uplink and downlink with the schedules they have, and where these begin [ns].
 
-    `start` is the key `start_s` of a profile. With a start at random, the time lines go round.
+    `start` is the key `start_s` of a profile. With a start at random, the schedules repeat.
     """
     up, down = map(going_round, ways) if start == RANDOM else ways
     return up, down, start_ns((up, down), start, seed, episode, stream)
@@ -43,7 +43,7 @@ def start_ns(
     episode: int,
     stream: str,
 ) -> int:
-    """Return where the time lines of both directions begin in an episode [ns]."""
+    """Return where the schedules of both directions begin in an episode [ns]."""
     if not isinstance(start, str):
         return round((start or 0.0) * 1e9)
     longest_ns = max(way.period_ns or 0 for way in ways)
@@ -51,9 +51,9 @@ def start_ns(
 
 
 def describe(start: Start | None, begins_ns: int, ways: tuple[DirectionProfile, ...]) -> str:
-    """Say where the time line begins; "" for its beginning."""
+    """Say where the schedule begins; "" for its beginning."""
     if not begins_ns:
         return ""
     period_ns = max(way.period_ns or 0 for way in ways)
     of = f" of {period_ns / 1e9:g} s, drawn" if start == RANDOM else ""
-    return f"the time line begins at {begins_ns / 1e9:.6g} s{of}"
+    return f"the schedule begins at {begins_ns / 1e9:.6g} s{of}"

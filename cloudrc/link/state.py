@@ -18,7 +18,7 @@ from cloudrc.base.files import write_atomically
 
 STATE_FILE = "link.json"  # name of the state file, in the folder of the route file
 STATE_MAX = 1 << 16
-"""Size limit of a state file that world or cloud reads [bytes]: room for a time line of about 800
+"""Size limit of a state file that world or cloud reads [bytes]: room for a schedule of about 800
 changes. Reading a file of 1 MiB could block the control loop for 2 s."""
 RELEASED_SUFFIX = ".released"
 """Suffix of the file in which a relay reports the lateness of datagrams: JSON, name -> integer."""
@@ -34,7 +34,7 @@ CHANGE_FILE = "change.json"  # last `ChangeFacts` of a profile, in the profile's
 class ChangeFacts:
     """Facts about a change of a link profile; `cloudrc link set` writes them to `CHANGE_FILE`.
 
-    If `restart` is True, the profile's time line starts again when the new profile takes effect.
+    If `restart` is True, the profile's schedule starts again when the new profile takes effect.
     """
 
     number: str = ""  # identifies the change; "" if unknown
@@ -57,7 +57,7 @@ class LinkState:
     change: str = ""  # number of the last change that took effect; "" if unknown
     cause: str = ""  # why the profile was changed, in words; "" before the first change
     asked: dict[str, float | None] = field(default_factory=dict)  # by `link.profile.summary`
-    origin_ns: int = 0  # start of the time line [ns]
+    origin_ns: int = 0  # start of the schedule [ns]
     refused: str = ""  # number of the last refused change; "" if no change was refused
     refusal: str = ""  # why the last refused change was refused, in words
 

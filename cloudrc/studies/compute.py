@@ -77,7 +77,7 @@ def of_run(folder: Path) -> MeasuredTimes:
     link, arrived = assembly.build_links(experiment)[1], recording["/downlink_delay"]
     if not experiment.cloud.compute_measured or link.only is None or experiment.is_fleet:
         text = "needs a flight in real time, or one with cloud.compute_measured and a link without"
-        raise NothingFlownError(f"{folder}: {text} a rate, keep_order and a time line")
+        raise NothingFlownError(f"{folder}: {text} a rate, keep_order and a schedule")
     size = COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
     times_ms = list[float]()
     for epoch, counter, delay in zip(*(arrived[name].tolist() for name in ARRIVAL), strict=True):

@@ -42,7 +42,7 @@ class LinkChanged(NamedTuple):
 
     The driver makes this record, in real time only: the driver of world for the uplink, that of
     cloud for the downlink. It does so at the start, after every change, and when a session or a
-    mission begins. The values are those at the start of the profile's time line.
+    mission begins. The values are those at the start of the profile's schedule.
     """
 
     stamp_ns: int
@@ -50,11 +50,11 @@ class LinkChanged(NamedTuple):
     shaper: Annotated[str, "", "relay or netem"]
     cause: Annotated[str, "", "why it changed; empty before the first change"]
     age: Annotated[float, "s", "time since these conditions took effect"]
-    time_line: Annotated[float, "s", "time since the time line (changes, blackouts, trace) began"]
-    delay: Annotated[float, "s", "profile's delay at the start of the time line, one way"]
-    jitter: Annotated[float, "s", "profile's jitter at the start of the time line"]
-    loss: Annotated[float, "1", "profile's mean loss at the start of the time line"]
-    rate: Annotated[float, "bit/s", "profile's rate at the start of the time line, or NaN"]
+    time_line: Annotated[float, "s", "time since the schedule (changes, blackouts, trace) began"]
+    delay: Annotated[float, "s", "profile's delay at the start of the schedule, one way"]
+    jitter: Annotated[float, "s", "profile's jitter at the start of the schedule"]
+    loss: Annotated[float, "1", "profile's mean loss at the start of the schedule"]
+    rate: Annotated[float, "bit/s", "profile's rate at the start of the schedule, or NaN"]
     conditions: Annotated[str, "", "the profile as JSON"]
 
 

@@ -31,7 +31,7 @@ def test_without_faults_nothing_changes_and_with_them_the_file_repeats_the_fligh
     assert load_experiment(tmp_path / "again.yaml") == with_fault
 
 
-def test_faults_are_on_the_time_line_of_their_direction():
+def test_faults_are_in_the_schedule_of_their_direction():
     found = faulty(
         "kind: partition, at_s: 5, duration_s: 1, direction: uplink",
         "kind: burst, at_s: 4, duration_s: 2, packets: 20, direction: downlink",
@@ -61,7 +61,7 @@ def test_a_partition_makes_the_robot_hold_while_it_lasts():
         ("kind: cut, at_s: 1, duration_s: 1", STEPS, "faults.0.kind"),
         ("kind: burst, at_s: 1, duration_s: 1", STEPS, "burst needs packets"),
         ("kind: ramp, at_s: 1, duration_s: 1, delay_ms: 9, packets: 2", STEPS, "has no packets"),
-        ("kind: partition, at_s: 1, duration_s: 1", "link.profile=handover", "goes round"),
+        ("kind: partition, at_s: 1, duration_s: 1", "link.profile=handover", "repeats"),
         ("kind: cloud_killed, at_s: 1", STEPS, "cloud_killed needs duration_s"),
         ("kind: clock_step, at_s: 1, step_s: -1", STEPS, "faults.0.step_s"),
         ("kind: clock_step, at_s: 1, step_s: 1, duration_s: 1", STEPS, "has no duration_s"),

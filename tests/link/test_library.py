@@ -85,7 +85,7 @@ def test_robots_with_one_seed_and_two_names_share_no_fate():
     assert not np.intersect1d(second, third).size
 
 
-def test_an_episode_begins_with_an_empty_bottleneck_and_at_the_start_of_the_time_line():
+def test_an_episode_begins_with_an_empty_bottleneck_and_at_the_start_of_the_schedule():
     slow = profile_of(0.01, rate=5e4, changes=(change(0.5, 0.1),))
     way = OneWay(slow, 1, uplink=True)
     first = [way.send(1, n, 1000, n * 100 * MS) for n in range(10)]

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The model of a direction: random draws, queue, order, time line and statistics."""
+"""The model of a direction: random draws, queue, order, schedule and statistics."""
 
 import random
 from math import erf, isnan, sqrt
@@ -212,7 +212,7 @@ def test_the_bottleneck_serialises_and_drops_from_the_tail():
     assert arrivals == [tuple(one * MS for one in copies) for copies in at]
 
 
-def test_the_time_line_counts_from_the_origin():
+def test_the_schedule_counts_from_the_origin():
     changes = (change(1.0, delay=0.050), change(2.0, jitter=0.0, loss=1.0), change(3.0, loss=0.0))
     profile = profile_of(0.020, changes=changes, blackouts=(blackout(4.0, 0.5), blackout(4.2, 1.0)))
     direction = LinkDirection(profile, 1, True, 7 * SECOND)

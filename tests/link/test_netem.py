@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""netem with a fake kernel: arguments of tc, set-up, restart, time line and removal."""
+"""netem with a fake kernel: arguments of tc, set-up, restart, schedule and removal."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ from cloudrc.config.profile import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.link.draws import Purpose, shape, stream_key
 from cloudrc.link.netem import STRETCH, Netem, check, explain, limit, options, table, write_table
-from cloudrc.link.profile import Timeline, Trace
+from cloudrc.link.profile import LinkSchedule, Trace
 from cloudrc.link.traces import link_profile
 from tests.link.profiles import blackout, change, in_bursts, profile_of
 
@@ -107,7 +107,7 @@ SLOW = profile_of(0.3, rate=2e6, queue_packets=100)
 
 def text(profile, at):
     check(profile)
-    return " ".join(options(profile, Timeline(profile).at(round(at * 1e9)), limit(profile)))
+    return " ".join(options(profile, LinkSchedule(profile).at(round(at * 1e9)), limit(profile)))
 
 
 @pytest.mark.parametrize(

@@ -223,7 +223,7 @@ def test_a_shipped_profile_for_a_minute(shaped, name, way):
         shaped.follow_profile(profile, restart=True)
         sender.start()
         while sender.is_alive():
-            shaped.step(0.1)  # as a link's process does, whether there is a time line or not
+            shaped.step(0.1)  # as a link's process does, whether there is a schedule or not
         found[:] = [tunnel.settle()]
         drawn[:] = [drawn_for(tunnel, profile, seed) for seed in range(20)]
         beside, mean = stranger.settle().delays().mean(), tunnel.delays().mean()
@@ -291,7 +291,7 @@ def test_it_is_set_up_once_and_removed_without_a_trace(make):
     assert qdiscs() == before
 
 
-def test_a_time_line_is_followed(make):
+def test_a_schedule_is_followed(make):
     """60 to 140 ms in waves of 4 s, one row per 20 ms; measured at the instants of sending."""
     times = 0.02 * np.arange(400)
     rows = 0.1 + 0.04 * np.sin(0.5 * np.pi * times)

@@ -20,7 +20,7 @@ from cloudrc.link.cell import Cell, CellQueue
 from cloudrc.link.library import LinkProfile
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile, Radio
-from cloudrc.link.radio import RadioParts, repetitions, schedule
+from cloudrc.link.radio import RadioParts, repetitions, slots_of
 from cloudrc.studies.eval.setup import Episode, EvalSetup, link_at
 from tests.link.profiles import changed, profile_of
 
@@ -56,7 +56,7 @@ def link(asked, uplink=True, seed=1, **keys):
     ],
 )
 def test_delays_at_random_phases_have_their_closed_form(asked, uplink, least, mean, most):
-    span = schedule(asked, uplink).span
+    span = slots_of(asked, uplink).span
     assert [each / MS + 3 for each in span] == pytest.approx([least, mean, most], abs=1e-9)
     sent_ns = np.random.default_rng(1).integers(0, 10**12, COUNT).tolist()
     found = delays(link(asked, uplink), sent_ns)
@@ -67,14 +67,14 @@ def test_delays_at_random_phases_have_their_closed_form(asked, uplink, least, me
 
 def test_a_packet_that_is_ready_when_a_slot_begins_takes_it():
     """U begins at 2.0 ms; the grant is ready at 4.5 ms, in which the next U begins."""
-    split = schedule(SURE, uplink=True).split
+    split = slots_of(SURE, uplink=True).split
     assert split(2 * MS, 0, 0) == RadioParts(0, 3 * MS, 0)
     assert split(2 * MS + 1, 0, 0) == RadioParts(10 * MS - 1, 3 * MS, 0)
     assert split(0, 2 * MS, 3) == RadioParts(0, 3 * MS, 15 * MS)
-    assert schedule(radio(grant_ms=2.000001), uplink=True).split(2 * MS, 0, 0).grant_ns == 5.5 * MS
-    free = schedule(radio(request_ms=0), uplink=True).split
+    assert slots_of(radio(grant_ms=2.000001), uplink=True).split(2 * MS, 0, 0).grant_ns == 5.5 * MS
+    free = slots_of(radio(request_ms=0), uplink=True).split
     assert [sum(free(at, 0, 0)) for at in (2 * MS, 2 * MS + 1)] == [500 * US, 3 * MS - 1]
-    down = schedule(SURE, uplink=False).split
+    down = slots_of(SURE, uplink=False).split
     assert [sum(down(at, 0, 0)) for at in (0, 1, MS, MS + 1)] == [
         500 * US, MS - 1, 500 * US, 2 * MS - 1
     ]  # fmt: skip
@@ -160,7 +160,7 @@ def test_the_radio_follows_the_bottleneck_and_order_is_kept_last():
     assert in_order == np.maximum.accumulate(arrivals).tolist()
 
 
-def test_the_time_of_the_radio_is_that_of_the_time_line():
+def test_the_time_of_the_radio_is_that_of_the_schedule():
     way = LinkDirection(DirectionProfile(radio=SURE), 1, True, 7 * MS)
     assert way.send(0, 128, 0, 100, 9 * MS) == (12 * MS,)
     assert way.only is None

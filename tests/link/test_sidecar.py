@@ -119,7 +119,7 @@ def test_relay_touches_no_netem_and_leaves_no_route(tmp_path):
     assert np.diff(bench.counted_ns) == pytest.approx(1e9, abs=0.1e9)
 
 
-def test_a_time_line_begins_where_it_is_asked_to_and_the_log_says_so(tmp_path):
+def test_a_schedule_begins_where_it_is_asked_to_and_the_log_says_so(tmp_path):
     bench = Bench(tmp_path, "relay")
     bench.sidecar.profile = Loaded(profile_of(), {}, start_ns=7, note="begins at 7 ns")
     assert bench.run().origins_ns == [-7]
@@ -155,11 +155,11 @@ def test_where_netem_fails_auto_takes_the_relay_and_netem_ends(tmp_path, refuses
     19,
     "dns-failure",
     injects="the peer's name does not resolve at first, later it has a new address",
-    expects="the link waits, then follows the address; its time line keeps its start",
+    expects="the link waits, then follows the address; its schedule keeps its start",
     figures="2 s without an address",
 )
 def test_the_peer_is_waited_for_and_its_new_address_followed(tmp_path):
-    """The time line keeps its start when another shaper takes over."""
+    """The schedule keeps its start when another shaper takes over."""
     bench = Bench(tmp_path, "auto")
     bench.route.write_text("10.0.0.1:7400\n")  # an earlier process was killed
     bench.sidecar.peer = None
@@ -190,7 +190,7 @@ def test_a_new_profile_is_followed_within_a_step(tmp_path):
     assert state["profile"] == {"description": "0.5 s"}
     assert state["asked"] == {"delay": 0.5, "jitter": 0.0, "loss": 0.0, "rate": None}
     assert 1.0e9 <= state["since_ns"] <= 1.2e9
-    assert state["origin_ns"] == 0, "the time line goes on"
+    assert state["origin_ns"] == 0, "the schedule goes on"
     assert bench.told()["cause"] == "the profile's file changed"
     assert 2.0e9 <= bench.told()["origin_ns"] <= 2.2e9
 
@@ -205,4 +205,4 @@ def test_a_profile_netem_cannot_do_is_refused_or_relayed(tmp_path):
     told = auto.run().told()
     assert any("netem cannot do delay_ms" in line for line in auto.log)
     assert (told["shaper"], told["changes"], told["refused"]) == ("relay", 1, "")
-    assert 1.0e9 <= told["origin_ns"] <= 1.2e9, "the relay begins the time line anew"
+    assert 1.0e9 <= told["origin_ns"] <= 1.2e9, "the relay begins the schedule anew"

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where a time line begins: numbers by hand, who shares a start, and capacity traces."""
+"""Where a schedule begins: numbers by hand, who shares a start, and capacity traces."""
 
 from math import sqrt
 
@@ -10,7 +10,7 @@ from cloudrc import link
 from cloudrc.base.errors import BadInputError
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.opportunities import Opportunities
-from cloudrc.link.profile import Timeline
+from cloudrc.link.profile import LinkSchedule
 from cloudrc.link.traces import read_opportunities
 from tests.link.profiles import profile_of
 
@@ -77,8 +77,8 @@ def test_a_new_profile_begins_its_own_line():
 @pytest.mark.parametrize(
     ("uplink", "start", "text"),
     [
-        ({"loop": True}, None, "uplink: loop: the time line has no period; give repeat_s"),
-        ({"delay_ms": 1}, "random", "start_s: random: the time line has no period"),
+        ({"loop": True}, None, "uplink: loop: the schedule has no period; give repeat_s"),
+        ({"delay_ms": 1}, "random", "start_s: random: the schedule has no period"),
         ({**BLACKOUT, "repeat_s": 1.4}, None, "repeat_s: 1.4 s ends before the last entry"),
         ({"rate_trace": "a.up", "rate_kbit": 5}, None, "rate_kbit and rate_trace are both a rate"),
         ({"delay_ms": 1}, "now", "start_s: 'now': must be a number >= 0 or one of random or null"),
@@ -141,4 +141,4 @@ def test_a_file_that_is_no_capacity_trace_is_refused(tmp_path, text):
 
 def test_the_period_of_handover_acts_at_random_alone():
     uplink = link.read_profile("handover").uplink
-    assert (uplink.period_ns, Timeline(uplink).period_ns) == (30_000 * MS, None)
+    assert (uplink.period_ns, LinkSchedule(uplink).period_ns) == (30_000 * MS, None)

@@ -213,9 +213,9 @@ def _report(
     """Judge the rows; write and return the file of the evaluation, and the path of its page."""
     from cloudrc.studies.eval import results
     from cloudrc.studies.eval.evidence import judge
+    from cloudrc.studies.eval.link_schedule import describe_met, find_met
     from cloudrc.studies.eval.page import write_page
     from cloudrc.studies.eval.provenance import provenance
-    from cloudrc.studies.eval.time_line import describe_met, find_met
 
     found = judge(rows, before, *known) | known._asdict()
     for outcome in found["outcomes"][1:]:

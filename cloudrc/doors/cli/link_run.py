@@ -38,7 +38,7 @@ def arguments(parser: Parser) -> None:
     parser.add_argument("--route", type=Path, required=True, metavar="FILE", help=about)
     about = "answer PUT /link on this Unix socket, which changes the link"
     parser.add_argument("--control", type=Path, metavar="FILE", help=about)
-    about = "start of the time line, monotonic clock [ns] (default: when the link comes up)"
+    about = "start of the schedule, monotonic clock [ns] (default: when the link comes up)"
     parser.add_argument(
         "--origin", type=whole_number(0, 2**63 - 1), default=0, metavar="NS", help=about
     )

@@ -33,7 +33,7 @@ examples:
   cloudrc link set --profile handover
   cloudrc link set --profile wifi uplink.rate_kbit=400 -n demo
 
-KEY is a key of a direction in a profile file. With --profile, time lines start
+KEY is a key of a direction in a profile file. With --profile, schedules start
 anew; single values leave them running. The change is recorded. It lasts until
 the next change, the end of the run, or 'helm upgrade'."""
 

@@ -41,7 +41,7 @@ def arguments(parser: Parser) -> None:
     )
     about = "the picture: .png, .svg or .pdf (default: NAME.png)"
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help=about)
-    about = "time to show (default: 30, or the whole time line)"
+    about = "time to show (default: 30, or the whole schedule)"
     parser.add_argument("--seconds", type=number(0.001, 86_400, "seconds"), metavar="S", help=about)
     about = "seed of the random draws (default: 1)"
     parser.add_argument("--seed", type=read_seed, default=1, metavar="S", help=about)

@@ -208,8 +208,8 @@ def warn(*experiments: ResolvedExperiment, seeds: int = 1) -> None:
 
 
 def warn_of_few_seeds(seeds: int, *experiments: ResolvedExperiment) -> None:
-    """Say if several seeds fly over one and the same part of a time line."""
-    from cloudrc.config.time_line import describe_one_time_line
+    """Say if several seeds fly over one and the same part of a schedule."""
+    from cloudrc.config.link_schedule import describe_one_schedule
 
-    if text := describe_one_time_line(seeds, *experiments):
+    if text := describe_one_schedule(seeds, *experiments):
         tell(text)

@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from cloudrc.base.errors import CloudrcError
-from cloudrc.link.profile import DirectionProfile, Timeline, settled
+from cloudrc.link.profile import DirectionProfile, LinkSchedule, settled
 from cloudrc.link.profile_file import read_keys
 from cloudrc.link.start import begin
 from cloudrc.link.streams import Stream
@@ -138,8 +138,8 @@ class LinkMonitor:
             self._store(record)
         if self._asked is None:
             return []
-        if self._fresh:  # a running time line is not judged, because its start is not known here
-            last_ns = max(Timeline(profile).last_ns for profile in self._asked)
+        if self._fresh:  # a running schedule is not judged, because its start is not known here
+            last_ns = max(LinkSchedule(profile).last_ns for profile in self._asked)
             settled_ns = now_ns + SETTLE_NS
             self._since_ns, self._due_ns = settled_ns + last_ns, settled_ns + CHECK_NS
             self._fresh, self._suspects = False, set()
@@ -199,7 +199,7 @@ class LinkMonitor:
         if not timed and not self._computes and not has_radio and len(self._trips) >= FEWEST:
             rows.append(self._round_trip())
         rows = [self._excuse(row) for row in rows]
-        if any(Timeline(one).only() is None for one in self._asked or ()):
+        if any(LinkSchedule(one).only() is None for one in self._asked or ()):
             rows.append(told("time_line", 1))
         if has_radio:  # its phase counts from a time that is not known here
             rows.append(told("radio", 1))

@@ -17,7 +17,7 @@ from cloudrc.link.state import STATE_MAX, LinkState, from_text
 LOOK_NS = 500_000_000
 """Time between two looks at the state file [ns]."""
 VALUE_MAX = 60
-"""Longest text of a value, such as a time line, in a sentence [characters]."""
+"""Longest text of a value, such as a schedule, in a sentence [characters]."""
 
 
 class LinkNews:
@@ -46,7 +46,7 @@ def describe_change(before: LinkState | None, after: LinkState) -> str:
     if changed := [*_differences(before.profile, after.profile)]:
         return f"the link has changed: {', '.join(changed)} ({to_one_line(after.cause)})"
     if after.changes > before.changes:
-        return f"the link's time line has begun again ({to_one_line(after.cause)})"
+        return f"the link's schedule has begun again ({to_one_line(after.cause)})"
     return ""
 
 

@@ -193,7 +193,7 @@ class LocalRun:
         self._start_end(robot, "world", ROUTE_FILE)
         self._start_teleop(robot)
         self._wait_until_ready()
-        # With cloud, which sends first: the time lines of the link begin shortly before the flight.
+        # With cloud, which sends first: the schedules of the link begin shortly before the flight.
         self._start_links(robot, up_ns := time.monotonic_ns())
         if self._remote:
             self._start(robot.folder, CONTROLLER, "policy", "drive", socket=robot.sockets)
@@ -257,7 +257,7 @@ class LocalRun:
         )
 
     def _start_links(self, robot: RobotProcesses, origin_ns: int) -> None:
-        """Start both directions of a robot's link; their time lines begin at `origin_ns` [ns]."""
+        """Start both directions of a robot's link; their schedules begin at `origin_ns` [ns]."""
         for way, end, peer in (("uplink", "world", "cloud"), ("downlink", "cloud", "world")):
             self._start(
                 robot.folder,

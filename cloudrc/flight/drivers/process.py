@@ -288,7 +288,7 @@ class LinkNotes:
         """Return the link's state as a record if it is new or a mission `begins`, else []."""
         try:
             state = from_text(read(self._state.path, STATE_MAX).decode())
-        except TooLongError:  # a long time line
+        except TooLongError:  # a long schedule
             self._since_ns = None
             self._check.request(None)
             return []

@@ -33,7 +33,7 @@ def run_tool(words: Sequence[str], environment: dict[str, str] | None = None) ->
 class Programs:
     """Runs tc and ip.
 
-    The steps of a time line have to take effect within milliseconds; starting a process takes
+    The steps of a schedule have to take effect within milliseconds; starting a process takes
     longer. Therefore one `tc -batch -` process stays open for all changes and lists of qdiscs.
     """
 

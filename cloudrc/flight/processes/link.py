@@ -59,7 +59,7 @@ class LinkSettings:
     end: Address | None  # from which the own tunnel end sends
     listen: Address  # where the relay receives datagrams
     route: Path  # file for the address to which the own tunnel end must send
-    origin: int  # start of the time line, monotonic clock [ns]; 0: when the link comes up
+    origin: int  # start of the schedule, monotonic clock [ns]; 0: when the link comes up
     control: Path | None = None  # Unix socket on which the link can be changed
     feed: bool = False  # write status for a supervisor to stdout
     metrics: Address | None = None  # serve metrics here
@@ -121,7 +121,7 @@ def make_profile_loader(direction: str, experiment: Path, seed: int) -> Load:
     """Return a function that reads one direction of the link from a profile's file.
 
     The file may name the profile, or leave the link to the file `experiment`. The `seed` decides
-    where a time line at random begins.
+    where a schedule at random begins.
     """
 
     def load(path: Path) -> Loaded:

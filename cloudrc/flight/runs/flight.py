@@ -11,8 +11,8 @@ from typing import Any, TypeAlias
 from cloudrc.base import plugins
 from cloudrc.base.errors import describe_error, machine_error
 from cloudrc.base.outside import code
+from cloudrc.config.link_schedule import link_start
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.time_line import link_start
 from cloudrc.flight import assembly
 from cloudrc.results.metrics.measure import SHIPPED, find
 from cloudrc.results.record.columns import Recording, RecordStore
@@ -24,7 +24,7 @@ ERROR = "error"
 Row: TypeAlias = dict[str, Any]
 """Result of a flight: `verdict`; `failures` (codes, `timed_out` first, then the earliest); `text`
 (the first failure, and why a metric has no value); `numbers` (metric -> value); `link_start`, where
-the time line of the link begins [s]; `records_sha256`;
+the schedule of the link begins [s]; `records_sha256`;
 `physics_steps`, the language of the physics steps and a hash of their machine code; and, if a
 plug-in failed, `traceback`. A row of a sweep also has `key`, `point`, `seed` and `code`, a hash of
 the sources."""

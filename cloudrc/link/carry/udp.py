@@ -185,7 +185,7 @@ class Relay:
     def follow_profile(
         self, profile: DirectionProfile, *, restart: bool = False, start_ns: int = 0
     ) -> None:
-        """Use this profile from now on; with `restart`, its time line starts at the next packet."""
+        """Use this profile from now on; with `restart`, its schedule starts at the next packet."""
         self._engine.take_in()  # datagrams that have arrived belong to the old profile
         self._way.link.replace_profile(profile, restart=restart, start_ns=start_ns)
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from cloudrc.link.draws import Floats
 from cloudrc.link.model import HEADER_BYTES, LinkDirection
-from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mean_loss
+from cloudrc.link.profile import DirectionProfile, GilbertElliott, LinkSchedule, mean_loss
 from cloudrc.link.streams import Stream, numbers, sample
 
 RUNS, RUN_LENGTH = 200, 1000
@@ -150,7 +150,7 @@ class Measurement:
         has at most RUN_LENGTH datagrams.
         """
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
-        sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
+        sent = self.sent[:few] if LinkSchedule(self.profile).only() else self.sent
         return replace(self, profile=netem_makes(self.profile))._simulated(RUNS, sent)
 
     def _simulated(self, count: int, sent: Floats) -> list[Stream]:
@@ -314,11 +314,11 @@ class Measurement:
 
 
 def _requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
-    timeline = Timeline(profile)
-    if len(timeline.pieces) == 1:
-        return np.full(len(sent), timeline.pieces[0].delay_ns * 1e-9)
+    schedule = LinkSchedule(profile)
+    if len(schedule.pieces) == 1:
+        return np.full(len(sent), schedule.pieces[0].delay_ns * 1e-9)
     times = np.rint(sent * 1e9).astype(np.int64).tolist()
-    return np.array([timeline.at(elapsed_ns).delay_ns for elapsed_ns in times]) * 1e-9
+    return np.array([schedule.at(elapsed_ns).delay_ns for elapsed_ns in times]) * 1e-9
 
 
 def netem_makes(profile: DirectionProfile) -> DirectionProfile:

@@ -13,7 +13,7 @@ import numpy as np
 from cloudrc.link.carry.log import LOST, PacketLog
 from cloudrc.link.library import KIND, PACKET_BYTES
 from cloudrc.link.model import HEADER_BYTES
-from cloudrc.link.profile import DirectionProfile, Timeline
+from cloudrc.link.profile import DirectionProfile, LinkSchedule
 from cloudrc.link.streams import Stream
 from cloudrc.link.verify.judge import Flow, Judgement, Measurement
 
@@ -36,7 +36,7 @@ class Period:
     seed: int
     uplink: bool
     first: int  # number of the first packet
-    origin_ns: int  # start of the profile's time line, monotonic clock [ns]
+    origin_ns: int  # start of the profile's schedule, monotonic clock [ns]
     cuts: bool = False  # whether large messages travel as several packets
 
 
@@ -54,7 +54,7 @@ def judge_packets(log: PacketLog, period: Period) -> list[tuple[float, Judgement
     size = round(np.mean(log.size[period.first :])) - HEADER_BYTES
     flow = Flow(period.seed, period.uplink, KIND, size)
     plan = Measurement(period.profile, flow, applied.sent)
-    limited = any(piece.rate is not None for piece in Timeline(period.profile).pieces)
+    limited = any(piece.rate is not None for piece in LinkSchedule(period.profile).pieces)
     few = slice(None, None, 1 + len(applied.sent) // ASKED_PACKETS)
     if limited:  # a packet waits for those before it
         few = slice(QUEUED_PACKETS)

@@ -27,7 +27,7 @@ from cloudrc.link.carry.udp import (
     ask_for_stamps,
 )
 from cloudrc.link.model import HEADER_BYTES
-from cloudrc.link.profile import DirectionProfile, Timeline
+from cloudrc.link.profile import DirectionProfile, LinkSchedule
 from cloudrc.link.streams import Stream
 from cloudrc.link.verify.judge import Flow, Measurement
 from cloudrc.wire.tunnel.codec import Direction, encode_header, peek
@@ -52,13 +52,13 @@ def plan_probes(
 ) -> Measurement:
     """Plan when to send probes, for `seconds` [s].
 
-    Without `seconds`, the duration is long enough for a verdict, and covers the profile's time line
+    Without `seconds`, the duration is long enough for a verdict, and covers the profile's schedule
     up to a limit. If the profile limits the rate, the probes are large, and half of them are sent
     in trains to measure the rate. `drawn` is True for netem: nobody can predict its random
     numbers, so a verdict may need more probes.
     """
-    timeline, train, step = Timeline(profile), 0, (2.0 if drawn else 1.0) / RATE
-    if (rate := min(piece.rate or inf for piece in timeline.pieces)) <= RATE_MAX:
+    schedule, train, step = LinkSchedule(profile), 0, (2.0 if drawn else 1.0) / RATE
+    if (rate := min(piece.rate or inf for piece in schedule.pieces)) <= RATE_MAX:
         flow = flow._replace(size=TRAIN_SIZE)
         wire = (TRAIN_SIZE + HEADER_BYTES) * 8.0 / rate
         train = max(4, min(64, profile.queue_packets // 2, ceil(TRAIN_SPAN / wire)))
@@ -70,7 +70,7 @@ def plan_probes(
         starts = FIRST_PROBE + np.arange(ceil(max(time, 2 * step) / length)) * length
         return Measurement(profile, flow, (starts[:, None] + block).ravel(), train)
 
-    last = timeline.last_ns * 1e-9
+    last = schedule.last_ns * 1e-9
     if seconds or last or not drawn:
         return plan(seconds or max(COUNT * step, min(last + AFTER, LONGEST) if last else 0.0))
     return plan(max(COUNT * step, min(plan(COUNT * step).needed() * step, LONGEST)))
@@ -128,7 +128,7 @@ def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
     drawn = np.concatenate([end.plan.draw(end.plan.sent).delays for end in ends])
     quiet = 0.5 + 2.0 * float(np.max(drawn, initial=0.0, where=drawn > 0.0))
     late = max((time.time_ns() - end.origin_ns) * 1e-9 + 0.05 - FIRST_PROBE for end in ends)
-    schedule = sorted(
+    sends = sorted(
         (end.origin_ns + round((at + max(0.0, late)) * 1e9), place, number)
         for place, end in enumerate(ends)
         for number, at in enumerate(end.plan.sent.tolist())
@@ -142,7 +142,7 @@ def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
     gc.collect()
     gc.disable()  # a garbage collection takes milliseconds
     try:
-        for due_ns, place, number in schedule:
+        for due_ns, place, number in sends:
             listen(due_ns)
             ends[place].send(number)
         listen(time.time_ns() + round(quiet * 1e9))

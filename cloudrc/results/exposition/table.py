@@ -300,7 +300,7 @@ _TABLE = (
     LiveMetric((LINK,), GAUGE, "cloudrc_link_delay_seconds",
                "Mean one-way delay that the current link profile sets.", {"direction": DIRECTIONS}),
     LiveMetric((LINK,), GAUGE, "cloudrc_link_step_lateness_seconds",
-               "Lateness of netem's last 10,000 changes on the profile's time line; absent "
+               "Lateness of netem's last 10,000 changes on the profile's schedule; absent "
                "without changes.", {"percentile": ("50", "99")}, counted="step_lateness_p*_ns"),
     LiveMetric((LINK,), COUNTER, "cloudrc_link_datagrams_total",
                "Datagrams at the shaper, by outcome.", {"outcome": LINK_OUTCOMES}, counted="*"),

@@ -62,7 +62,7 @@ def holds(flight: Flight) -> list[tuple[int, int]]:
 def came_up(flight: Flight, link_start: float) -> float:
     """Return when the link came up, in seconds since the start of the mission.
 
-    `link_start` is where its time line began [s]. The processes of a link tell it. In virtual time
+    `link_start` is where its schedule began [s]. The processes of a link tell it. In virtual time
     it comes up at 0 on world's clock, which takes the first sample then. Else telemetry may be the
     first to cross it.
     """

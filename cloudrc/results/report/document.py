@@ -14,8 +14,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
+from cloudrc.config.link_schedule import link_start
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
-from cloudrc.config.time_line import link_start
 from cloudrc.results.metrics.budget import budget_of
 from cloudrc.results.metrics.flight import Flight
 from cloudrc.results.metrics.measure import Number

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from cloudrc.base import source
 from cloudrc.base.text import Paint, cells, escape, list_some, plain, table
+from cloudrc.config.link_schedule import link_start
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
-from cloudrc.config.time_line import link_start
 from cloudrc.link.cell import Usage
 from cloudrc.link.waiting import md1, nddd1
 from cloudrc.results.metrics.verdict import EXIT_CODES

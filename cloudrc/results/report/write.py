@@ -14,9 +14,9 @@ import numpy as np
 from cloudrc.base.errors import CloudrcError, describe_error
 from cloudrc.base.files import read_json, write_atomically, write_json
 from cloudrc.config.faults import CLOUD_KILLED, WORLD_PAUSED, acting
+from cloudrc.config.link_schedule import link_start
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
-from cloudrc.config.time_line import link_start
 from cloudrc.physics.geometry.obstacles import has_surface, obstacles
 from cloudrc.results.metrics.flight import Flight, select
 from cloudrc.results.metrics.measure import measure_all

@@ -33,7 +33,7 @@ def measure(flight: Flight, changes: Sequence[float]) -> dict[str, Any]:
 
 
 def _delays(flight: Flight, edges: Sequence[float]) -> dict[str, Any]:
-    """Return mean and half of the range of the delays [s], in each part of the link's time line."""
+    """Return mean and half of the range of the delays [s], in each part of the link's schedule."""
     ways = [flight.during(f"/{way}_delay") for way in ("uplink", "downlink")]
     arrived, delays = (
         np.concatenate([way[name] for way in ways]) for name in ("stamp_ns", "delay")

@@ -32,14 +32,14 @@ TIMED = {"uplink": {"delay_ms": 40.0}, "downlink": {"delay_ms": 25.0, "changes":
          []),
         ("downlink.delay_ms=120", "downlink",
          {"delay_ms": 120.0, "changes": [{"at_s": 9.0, "jitter_ms": 20.0}, CHANGES[1]]},
-         ["the time line of the downlink no longer changes delay_ms"]),
+         ["the schedule of the downlink no longer changes delay_ms"]),
     ],
 )  # fmt: skip
 def test_a_value_set_by_hand_stays_and_the_rest_goes_on(settings, way, values, notes):
     made = edit_profile(Document(deepcopy(TIMED)), None, settings.split())
     assert made.values[way] == values
     assert (made.cause, made.notes) == (settings.replace(" ", ", "), notes)
-    assert not made.restart, "the time line goes on where it is"
+    assert not made.restart, "the schedule goes on where it is"
 
 
 def test_a_delay_set_by_hand_ends_a_trace(tmp_path):

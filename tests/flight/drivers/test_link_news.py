@@ -22,7 +22,7 @@ STATE = LinkState(
           "cause": "the profile's file changed"},
          "the link has changed: uplink.loss 0.05 (was not set), downlink.delay_ms 70 (was 45), "
          "downlink.jitter_ms not set (was 25) (the profile's file changed)"),
-        ({"changes": 1, "cause": "link set"}, "the link's time line has begun again (link set)"),
+        ({"changes": 1, "cause": "link set"}, "the link's schedule has begun again (link set)"),
     ],
 )  # fmt: skip
 def test_a_change_is_told_once_with_old_and_new_values(tmp_path, changed, said):

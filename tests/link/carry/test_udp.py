@@ -152,7 +152,7 @@ def test_the_peer_can_restart_and_can_change_in_flight(bench):
 
 def carried(experiment, duration, rate):
     """Send probes over a link; return what was measured, what was drawn, and the relays' counts."""
-    # Half a period away from the instants at which time lines change: a probe takes time.
+    # Half a period away from the instants at which schedules change: a probe takes time.
     sent = FIRST_PROBE + (np.arange(round(duration * rate)) + 0.5) / rate
     plans = {
         way: Measurement(

@@ -29,7 +29,7 @@ def following(sent, limits=PLANS, now_ns=0):
     return guard
 
 
-def test_a_plan_is_played_on_its_own_time_line():
+def test_a_plan_is_played_at_its_own_times():
     guard = following(planned([0.0, 0.1, 0.2, 0.3], planned_ns=10 * MS), now_ns=20 * MS)
     flown = [reference[0] for reference in run(guard, 20 * MS, 60 * MS)]
     assert flown[4::5] == [0.1, 0.2, 0.3, 0.3]

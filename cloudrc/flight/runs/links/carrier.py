@@ -58,7 +58,7 @@ class LiveLink:
         folder: Folder of the states, and of the profile.
         url: URL beside which the sockets are that take changes.
         states: Direction -> its present state; empty before `serve`.
-        origins_ns: Direction -> start of its time line, monotonic clock [ns].
+        origins_ns: Direction -> start of its schedule, monotonic clock [ns].
         ways: Direction -> what happened to its packets; empty before `carry`.
         engine: Carries the packets; None before `serve`.
         unread: Direction -> number of packets that were dropped before the engine has read them.
@@ -115,7 +115,7 @@ class LiveLink:
         return self._loaded[way].direction
 
     def begin(self) -> int:
-        """Begin the time line; return when its time was 0, monotonic clock [ns]."""
+        """Begin the schedule; return when its time was 0, monotonic clock [ns]."""
         first = self._loaded["uplink"]  # both directions begin at one place
         if first.note:
             self._tell(first.note)
@@ -124,7 +124,7 @@ class LiveLink:
         return origin_ns
 
     def carry(self, gives: Mapping[str, Callable[[Any], bool]]) -> None:
-        """Begin the time line of `ways`; `gives` has a function per direction that hands on."""
+        """Begin the schedule of `ways`; `gives` has a function per direction that hands on."""
         origin_ns = self.begin()
         for way, give in gives.items():
             up, profile = way == "uplink", self.profile(way)

@@ -182,7 +182,7 @@ class _Run:
             return ExecOutcome(InterruptedRunError.exit_code, {}, interrupted=True)
 
     def _start_link(self) -> _EngineThread:
-        """Carry packets between the devices of both ends; the time line begins."""
+        """Carry packets between the devices of both ends; the schedule begins."""
         link, devices = self._link, {name: end.device for name, end in self.ends.items()}
         link.carry({way: partial(write_packet, devices[to]) for way, (_, to) in FLOWS.items()})
         port = TunPort({devices[one]: link.ways[way] for way, (one, _) in FLOWS.items()})

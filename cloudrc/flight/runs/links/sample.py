@@ -15,22 +15,22 @@ from cloudrc.base.text import table
 from cloudrc.config.profile import DIRECTIONS, DirectionConfig, Profile, load_profile
 from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.profile import Timeline, Trace
-from cloudrc.link.radio import schedule
+from cloudrc.link.profile import LinkSchedule, Trace
+from cloudrc.link.radio import slots_of
 from cloudrc.link.streams import Numbers, Stream, numbers, sample
 from cloudrc.link.traces import link_profile, read_trace
 from cloudrc.results.report.figures.link import DirectionSample
 from cloudrc.wire.tunnel.codec import SIZES, TELEMETRY_SIZES, Kind
 
 ROWS = 1000  # least number of packets for a trace that has shares of losses
-SECONDS = 30.0  # time that a figure shows by default [s]; a longer time line is shown in full
+SECONDS = 30.0  # time that a figure shows by default [s]; a longer schedule is shown in full
 
 
 @dataclass(frozen=True)
 class SampleSettings:
     """Which packets to send; a field is the flag of this name."""
 
-    seconds: float | None = None  # time to show [s]; None: `SECONDS`, or the whole time line
+    seconds: float | None = None  # time to show [s]; None: `SECONDS`, or the whole schedule
     seed: int = 1  # of the random draws
     rate: float = 100.0  # packets per second [1/s]
     packets: int = 100_000  # for the statistics of an unchanging link
@@ -74,7 +74,7 @@ def _sample(
     If the conditions are constant, the statistics come from more packets than the figure shows.
     """
     profile = link_profile(asked)
-    timeline, period_ns = Timeline(profile), round(1e9 / settings.rate)
+    schedule, period_ns = LinkSchedule(profile), round(1e9 / settings.rate)
     # Telemetry of a robot with one sensor of its own.
     kind, size = Kind.COMMAND, SIZES[Kind.COMMAND]
     if uplink:
@@ -86,11 +86,11 @@ def _sample(
     if profile.rows is not None and settings.seconds is None:
         shown = send(_row_times(profile.rows))
     else:
-        seconds = settings.seconds or max(SECONDS, 1.1e-9 * timeline.last_ns)
+        seconds = settings.seconds or max(SECONDS, 1.1e-9 * schedule.last_ns)
         count = max(1, round(seconds * settings.rate))
         shown = send(range(0, count * period_ns, period_ns))
     many = shown
-    if timeline.only() is not None:
+    if schedule.only() is not None:
         many = send(range(0, settings.packets * period_ns, period_ns))
     return DirectionSample(label, asked, shown.sent, shown.delays, many.delays), numbers(many)
 
@@ -151,5 +151,5 @@ def _at_random_phases(asked: DirectionConfig, *, uplink: bool) -> tuple[float, .
     """Return the values of `AT_RANDOM_PHASES` for a direction without jitter [ms]."""
     if asked.radio is None:
         return *(asked.delay_ms,) * 3, 0.0
-    found = schedule(asked.radio, uplink)
+    found = slots_of(asked.radio, uplink)
     return *(asked.delay_ms + each * 1e-6 for each in found.span), found.repeats_ns * 1e-6

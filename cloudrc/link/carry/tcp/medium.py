@@ -11,7 +11,7 @@ from collections import deque
 from dataclasses import replace
 
 from cloudrc.link.model import LinkDirection, enqueue
-from cloudrc.link.profile import Conditions, DirectionProfile, Timeline
+from cloudrc.link.profile import Conditions, DirectionProfile, LinkSchedule
 from cloudrc.link.radio import mean_delay
 
 SEGMENT = 1448
@@ -34,7 +34,7 @@ class Medium:
         stream: str = "",
         headers: int = HEADERS,
     ) -> None:
-        """Make the direction; its time line begins at `origin_ns` [ns].
+        """Make the direction; its schedule begins at `origin_ns` [ns].
 
         `stream` is the name of the link. Each segment has `headers` [bytes] on the wire.
         """
@@ -48,10 +48,10 @@ class Medium:
     def replace_profile(
         self, profile: DirectionProfile, *, restart: bool = False, start_ns: int = 0
     ) -> None:
-        """Use another profile from now on; with `restart`, its time line is at `start_ns` now."""
+        """Use another profile from now on; with `restart`, its schedule is at `start_ns` now."""
         if restart:
             self._origin_ns, self._start_ns = None, start_ns
-        self._queue_packets, self._timeline = profile.queue_packets, Timeline(profile)
+        self._queue_packets, self._schedule = profile.queue_packets, LinkSchedule(profile)
         self._radio_ns = round(mean_delay(profile, self._uplink) * 1e9)
         changes = tuple(replace(change, rate_kbit=None) for change in profile.changes)
         behind = replace(profile, rate_kbit=None, changes=changes)  # what follows the bottleneck
@@ -91,4 +91,4 @@ class Medium:
     def _at(self, now_ns: int) -> Conditions:
         if self._origin_ns is None:
             self._origin_ns = now_ns - self._start_ns
-        return self._timeline.at(now_ns - self._origin_ns)
+        return self._schedule.at(now_ns - self._origin_ns)

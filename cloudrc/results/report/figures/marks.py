@@ -17,8 +17,8 @@ from matplotlib.axes import Axes
 from cloudrc.base.errors import CloudrcError
 from cloudrc.config.faults import FaultConfig
 from cloudrc.config.profile import DirectionConfig
-from cloudrc.link.profile import Timeline
-from cloudrc.link.radio import schedule
+from cloudrc.link.profile import LinkSchedule
+from cloudrc.link.radio import slots_of
 from cloudrc.link.traces import link_profile
 from cloudrc.results.metrics.flight import Array, rows_of, select
 from cloudrc.results.metrics.mission import came_up, holds
@@ -30,10 +30,10 @@ SAME_CAUSE = 1.0
 HELD = " Red: the guard was in HOLD."
 
 
-def delays_of(direction: DirectionConfig) -> Timeline | None:
+def delays_of(direction: DirectionConfig) -> LinkSchedule | None:
     """Return a direction's link conditions over time; None if a file for them is unreadable."""
     try:
-        return Timeline(link_profile(direction))
+        return LinkSchedule(link_profile(direction))
     except CloudrcError:
         return None
 
@@ -42,12 +42,12 @@ def radio_span(direction: DirectionConfig, *, uplink: bool) -> tuple[float, floa
     """Return the shortest and longest delay in a radio, without repetitions [ms]; 0 without one."""
     if direction.radio is None:
         return 0.0, 0.0
-    span = schedule(direction.radio, uplink).span
+    span = slots_of(direction.radio, uplink).span
     return span.least * 1e-6, span.most * 1e-6
 
 
 def band(
-    delays: Timeline, time: Array, radio: tuple[float, float] = (0.0, 0.0)
+    delays: LinkSchedule, time: Array, radio: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[Array, Array]:
     """Compute delay - jitter and delay + jitter [ms] at each `time` [s] since the link's start.
 
@@ -68,7 +68,7 @@ class LinkSpan(NamedTuple):
     """
 
     begin: float  # [s]; -inf for the profile at the start of the flight
-    origin: float  # start of the profile's time line [s]
+    origin: float  # start of the profile's schedule [s]
     direction: DirectionConfig
     cause: str  # cause of the change; "" if the link started with this profile
 

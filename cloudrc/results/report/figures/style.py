@@ -115,7 +115,7 @@ class Subject:
     downlink: DirectionConfig
     look: Look = Look()
     shapes: Shapes = NOTHING  # of robot and scene
-    link_start: float = 0.0  # where the time line of the link begins [s]
+    link_start: float = 0.0  # where the schedule of the link begins [s]
     faults: tuple[FaultConfig, ...] = ()  # that the experiment injects
 
     @property

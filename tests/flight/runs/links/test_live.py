@@ -12,8 +12,8 @@ from cloudrc.flight.runs.links.carrier import CarrySettings, LiveLink
 from cloudrc.flight.runs.links.change import set_here
 
 
-@pytest.mark.parametrize(("start", "note"), [("12", "the time line begins at 12 s"), ("0", "")])
-def test_a_link_that_comes_up_tells_where_its_time_line_begins(start, note):
+@pytest.mark.parametrize(("start", "note"), [("12", "the schedule begins at 12 s"), ("0", "")])
+def test_a_link_that_comes_up_tells_where_its_schedule_begins(start, note):
     told = []
     with contextlib.ExitStack() as stack:
         asked = CarrySettings("handover", [f"start_s={start}"], 1)
@@ -31,7 +31,7 @@ def test_a_link_that_comes_up_tells_where_its_time_line_begins(start, note):
     [
         (None, ["uplink.delay_ms=300"], ["uplink"]),
         (None, ["uplink.delay_ms=30"], []),  # as before
-        ("lte", [], ["uplink", "downlink"]),  # the time lines begin again
+        ("lte", [], ["uplink", "downlink"]),  # the schedules begin again
     ],
 )
 def test_a_change_is_told_for_the_directions_that_it_changes(profile, settings, changed):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Episodes over a time line: where each begins, what was asked, and links that vary."""
+"""Episodes over a schedule: where each begins, what was asked, and links that vary."""
 
 from math import isnan
 
@@ -92,7 +92,7 @@ def test_what_is_asked_is_that_of_the_part_that_is_met():
         ({"delay_ms": 10, "rate_kbit": 102.4}, 0.01 + 0.01, 0.0),
     ],
 )  # fmt: skip
-def test_the_pieces_of_a_time_line_ask_for_what_is_true_by_hand(values, delay, loss):
+def test_the_pieces_of_a_schedule_ask_for_what_is_true_by_hand(values, delay, loss):
     change = {"at_s": 1000, "delay_ms": 999}
     found = PartsAsked(wire({**values, "changes": [change]}), 0.02).of(Met(0, 100 * SECOND))
     assert found == pytest.approx((delay, loss), rel=2e-3)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The start of a flight's time line: keys, hashes, and what is told."""
+"""The start of a flight's schedule: keys, hashes, and what is told."""
 
 from dataclasses import replace
 
@@ -8,9 +8,9 @@ import pytest
 
 from cloudrc.base.outside.document import Document
 from cloudrc.config.link_edit import edit_profile
+from cloudrc.config.link_schedule import describe_one_schedule, find_ways, link_start
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import dump, fingerprint
-from cloudrc.config.time_line import describe_one_time_line, find_ways, link_start
 from cloudrc.flight.assembly import build_links
 from tests.config.conftest import refused_line
 
@@ -71,10 +71,10 @@ def test_a_flight_at_random_goes_round():
 @pytest.mark.parametrize(
     ("setting", "text"),
     [
-        ("link.start_s=random", "the time line has no period; give repeat_s"),
+        ("link.start_s=random", "the schedule has no period; give repeat_s"),
         ("link.start_s=soon", "--set: link.start_s: 'soon': must be 'random'"),
         ("link.start_s=-1", "--set: link.start_s: -1: must be"),
-        ("link.uplink.loop=true", "loop: the time line has no period; give repeat_s"),
+        ("link.uplink.loop=true", "loop: the schedule has no period; give repeat_s"),
     ],
 )
 def test_what_cannot_be_is_refused(setting, text):
@@ -90,11 +90,11 @@ def test_a_period_within_the_trace_is_refused_with_its_key(tmp_path):
 
 def test_several_seeds_over_one_line_are_told():
     line, bare = (load_experiment("fast", [f"link.profile={name}"]) for name in ("handover", "lte"))
-    text = "20 seeds, one time line: --set link.start_s=random"
-    assert describe_one_time_line(20, bare, line) == text
-    assert describe_one_time_line(20, bare) == describe_one_time_line(1, line) == ""
+    text = "20 seeds, one link schedule: --set link.start_s=random"
+    assert describe_one_schedule(20, bare, line) == text
+    assert describe_one_schedule(20, bare) == describe_one_schedule(1, line) == ""
     drawn = load_experiment("fast", [HANDOVER, RANDOM])
-    assert describe_one_time_line(20, drawn) == ""
+    assert describe_one_schedule(20, drawn) == ""
 
 
 def test_link_set_begins_a_line_at_its_start():

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Commands over a time line: what they say, and what rows and reports have."""
+"""Commands over a schedule: what they say, and what rows and reports have."""
 
 import json
 
@@ -9,7 +9,7 @@ import pytest
 from cloudrc.link.library import read_profile
 
 SHORT = "--set link.profile=handover --set mission.steps.count=1"
-LINE = "2 seeds, one time line: --set link.start_s=random"
+LINE = "2 seeds, one link schedule: --set link.start_s=random"
 
 
 def rows_of(folder):
@@ -17,7 +17,7 @@ def rows_of(folder):
 
 
 @pytest.mark.usefixtures("one_core")
-def test_seeds_over_one_time_line_are_told_and_begin_at_0(call, tmp_path):
+def test_seeds_over_one_schedule_are_told_and_begin_at_0(call, tmp_path):
     found = {}
     for start in ("null", "random"):
         out = tmp_path / start

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Find where in the time line of its link a flight begins."""
+"""Find where in the schedule of its link a flight begins."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cloudrc.link.traces import link_profile
 def find_ways(
     experiment: ResolvedExperiment,
 ) -> tuple[DirectionProfile, DirectionProfile, int]:
-    """Return the conditions of uplink and downlink, and where their time lines begin [ns].
+    """Return the conditions of uplink and downlink, and where their schedules begin [ns].
 
     A fleet is at one place at one time, so the link of each of its robots begins there, too.
     """
@@ -24,7 +24,7 @@ def find_ways(
 
 
 def link_start(experiment: ResolvedExperiment) -> float | None:
-    """Return where the time line of the link begins [s]; None if a file for it is lost."""
+    """Return where the schedule of the link begins [s]; None if a file for it is lost."""
     start = experiment.link.start_s
     if not isinstance(start, str):
         return start or 0.0
@@ -34,11 +34,11 @@ def link_start(experiment: ResolvedExperiment) -> float | None:
         return None
 
 
-def describe_one_time_line(seeds: int, *experiments: ResolvedExperiment) -> str:
-    """Say that flights with several seeds meet one part of the time line; "" if they do not."""
+def describe_one_schedule(seeds: int, *experiments: ResolvedExperiment) -> str:
+    """Say that flights with several seeds meet one part of the schedule; "" if they do not."""
     for experiment in experiments:
         link = experiment.link
         repeats = any(getattr(link, way).may_repeat for way in DIRECTIONS)
         if seeds > 1 and repeats and link.start_s is None:
-            return f"{seeds} seeds, one time line: --set link.start_s=random"
+            return f"{seeds} seeds, one link schedule: --set link.start_s=random"
     return ""

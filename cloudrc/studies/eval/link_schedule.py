@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Say which part of its link's time line an evaluation has met."""
+"""Say which part of its link's schedule an evaluation has met."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from cloudrc.flight.trials.rows import Row
 from cloudrc.gym.links import choose_link
-from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
+from cloudrc.link.profile import DirectionProfile, LinkSchedule, mean_loss
 from cloudrc.studies.eval.setup import BASELINE, EvalSetup
 
 OUTAGE = 0.99
@@ -20,14 +20,14 @@ SHOWN = 6
 
 
 class Span(NamedTuple):
-    """A part of a time line, without the end."""
+    """A part of a schedule, without the end."""
 
     begin: float  # [s]
     end: float  # [s]
 
 
 def find_met(setup: EvalSetup, rows: Sequence[Row]) -> dict[str, Any] | None:
-    """Return which part of the time line the episodes with a network have met, in plain values.
+    """Return which part of the schedule the episodes with a network have met, in plain values.
 
     Return None for a link that does not change.
     """
@@ -36,7 +36,7 @@ def find_met(setup: EvalSetup, rows: Sequence[Row]) -> dict[str, Any] | None:
     rows = [row for row in rows if row["point"]["executor"] != BASELINE]
     assert setup.step is not None, "an environment that was played has a time step"
     dt = setup.step.seconds
-    lines = [Timeline(way) for way in (link.uplink, link.downlink)]
+    lines = [LinkSchedule(way) for way in (link.uplink, link.downlink)]
     if not rows or all(line.only() is not None for line in lines):
         return None
     periods = [line.period_ns / 1e9 for line in lines if line.period_ns is not None]
@@ -59,7 +59,7 @@ def find_met(setup: EvalSetup, rows: Sequence[Row]) -> dict[str, Any] | None:
 
 def _events(way: DirectionProfile) -> Iterator[Span]:
     """Yield the outages of a direction; without any, its changes, if they are few."""
-    line = Timeline(way)
+    line = LinkSchedule(way)
     edges = [*line.pass_ns, line.period_ns or line.pass_ns[-1] + 1_000_000_000]
     spans = [Span(a / 1e9, b / 1e9) for a, b in pairwise(edges)]
     out = [
@@ -74,7 +74,7 @@ def _events(way: DirectionProfile) -> Iterator[Span]:
 
 
 def _within(met: Span, period: float | None) -> Iterator[Span]:
-    """Yield the parts of a time line that goes round."""
+    """Yield the parts of a schedule that repeats."""
     if period is None:
         yield met
     elif met.end - met.begin >= period:
@@ -108,11 +108,11 @@ def _meets(met: Span, event: Span, period: float | None) -> bool:
 
 
 def describe_met(found: Mapping[str, Any]) -> Iterator[str]:
-    """Say which part of the time line was met, and how many episodes met each of its events."""
+    """Say which part of the schedule was met, and how many episodes met each of its events."""
     period, count = found["period"], found["episodes"]
     parts = [f"{begin:.3g} to {end:.3g} s" for begin, end in found["met"]]
     more = f" and {len(parts) - SHOWN} more parts" * (len(parts) > SHOWN)
-    line = "time line" if period is None else f"time line of {period:g} s"
+    line = "link schedule" if period is None else f"link schedule of {period:g} s"
     yield f"{line}: {', '.join(parts[:SHOWN])}{more} met by {count} episodes"
     for each in found["events"][:SHOWN]:
         length = each["end"] - each["begin"]

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What an evaluation tells of the time line that it met."""
+"""What an evaluation tells of the schedule that it met."""
 
 import json
 
@@ -8,8 +8,8 @@ import pytest
 
 from cloudrc.gym.step import StepTime
 from cloudrc.link.library import read_profile
+from cloudrc.studies.eval.link_schedule import describe_met, find_met
 from cloudrc.studies.eval.setup import EvalSetup
-from cloudrc.studies.eval.time_line import describe_met, find_met
 
 STEP = StepTime(0.02, "given")
 
@@ -33,7 +33,7 @@ def test_an_episode_meets_an_event_of_the_next_pass():
     assert [each["met"] for each in found["events"]] == [1, 0]
 
 
-def test_a_link_that_does_not_change_has_no_time_line():
+def test_a_link_that_does_not_change_has_no_schedule():
     assert find_met(EvalSetup("E", "p", link="lte", step=STEP), [row(0.0, 500)]) is None
 
 
@@ -61,7 +61,7 @@ def test_the_outages_that_episodes_of_cartpole_meet_are_told(law, evaluate, tmp_
             for start, end in zip(starts, ends, strict=True)
         )
         assert 0 < event["met"] == drawn < 8
-    assert any(note.startswith("time line of 4 s: ") for note in document["notes"])
+    assert any(note.startswith("link schedule of 4 s: ") for note in document["notes"])
 
 
 def test_a_profile_is_known_by_where_it_begins(tmp_path):
@@ -78,5 +78,5 @@ def test_a_line_without_a_period_is_told(tmp_path, length):
     (tmp_path / "p.yaml").write_text("uplink: {changes: [{at_s: 5, delay_ms: 9}]}\n")
     setup = EvalSetup("E", "p", link=str(tmp_path / "p.yaml"), step=STEP)
     told = [*describe_met(find_met(setup, [row(0.0, length)]))]
-    assert told[0].startswith("time line: 0 to ")
+    assert told[0].startswith("link schedule: 0 to ")
     assert ("no episode" in told[1]) is (length == 1)
