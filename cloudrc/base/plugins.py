@@ -42,7 +42,7 @@ PACKAGES = {
     "perceptions": "cloudrc.cloud.perceptions",
     "onboard": "cloudrc.robots.onboard",
     "executors": "",
-    "channels": "cloudrc.flight.drivers.channels",
+    "transports": "cloudrc.flight.drivers.transports",
     "motion": "",
     "metrics": "",
     "policies": "",

@@ -47,11 +47,11 @@ from cloudrc.wire.records import (
     SessionOpened,
 )
 from cloudrc.wire.tunnel import codec
-from cloudrc.wire.tunnel.channel import LATE, REPEATED, USED
 from cloudrc.wire.tunnel.codec import Accept, DecodeError, Direction, Kind
 from cloudrc.wire.tunnel.end import Identity, TunnelEnd
 from cloudrc.wire.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake
 from cloudrc.wire.tunnel.session import NO_EPOCH
+from cloudrc.wire.tunnel.window import LATE, REPEATED, USED
 
 LATE_NS, LATE_WINDOW_NS = 500_000_000, 10_000_000_000
 """Cloud reports a fault, once per session, if the periods that it misses within LATE_WINDOW_NS add
@@ -316,7 +316,7 @@ class CloudEndpoint(TunnelEnd):
             return
         self._session.begin(epoch, nonces, self._session.greeting_key)
         self._told.clear()
-        self._channel.reset()
+        self._window.reset()
         self.sight.begin_session(epoch)
         self._loop.reset(now_ns)
         self._setpoint = None  # the robot may have moved; teleop sends a new one
@@ -330,7 +330,7 @@ class CloudEndpoint(TunnelEnd):
         self._records.append(SessionOpened(now_ns, "cloud", epoch, "world accepted"))
 
     def _receive_telemetry(self, epoch: int, counter: int, body: Any, now_ns: int) -> None:
-        outcome = self._channel.take(counter)
+        outcome = self._window.take(counter)
         if outcome != REPEATED:  # an attacker can repeat datagrams
             self._heard_ns = now_ns
         self.counts[outcome] += 1
@@ -338,7 +338,7 @@ class CloudEndpoint(TunnelEnd):
         telemetry, delay = codec.decode_telemetry(body) if type(body) is bytes else body, nan
         if self._clock_is_shared:
             delay = (now_ns - telemetry.stamp_ns - telemetry.slip_ns) * 1e-9
-        if outcome != REPEATED or not self._channel.is_flooded:
+        if outcome != REPEATED or not self._window.is_flooded:
             echo = telemetry.echo_stamp_ns, telemetry.echo_hold_ns
             fields = now_ns, True, epoch, counter, delay, used, *echo
             is_sample = used and self._loop.gives_sample(*echo)

@@ -14,8 +14,8 @@ from cloudrc.cloud.receiving import FrameReceiver
 from cloudrc.wire.messages import RangeScan
 from cloudrc.wire.records import Record
 from cloudrc.wire.tunnel import codec
-from cloudrc.wire.tunnel.channel import USED, ReceiveWindow
 from cloudrc.wire.tunnel.codec import Kind
+from cloudrc.wire.tunnel.window import USED, ReceiveWindow
 
 KINDS = frozenset((int(Kind.SCAN), int(Kind.FRAME)))
 """Kinds of datagrams with what the robot sees."""

@@ -23,7 +23,7 @@ from cloudrc.base.errors import ControllerLostError
 from cloudrc.base.outside.code import apart
 from cloudrc.cloud.compute_time import ComputeTime, compute_time
 from cloudrc.cloud.controllers import Controller
-from cloudrc.cloud.controllers.remote import ControllerChannel, OutsideController
+from cloudrc.cloud.controllers.remote import ControllerTransport, OutsideController
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.news import SendOnDelta
@@ -37,7 +37,7 @@ from cloudrc.config.mission_check import start_of
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
-from cloudrc.flight.drivers.channels import find_channel
+from cloudrc.flight.drivers.transports import find_transport
 from cloudrc.flight.legs import LEG_FACTOR, leg_to, step_legs
 from cloudrc.flight.sensing import build_film, build_receiver, build_scanner, build_target
 from cloudrc.link.cell import FRAME_NS, Bulk, Cell, Video
@@ -78,15 +78,15 @@ VIRTUAL_RING = KeyRing(KeySet(Key(b"nothing is secret in one process")))
 def assemble(
     experiment: ResolvedExperiment,
     make_loop: Callable[..., ControlLoop] = ControlLoop,
-    channel: ControllerChannel | None = None,
+    transport: ControllerTransport | None = None,
     *,
     queue: Callable[[Sequence[LinkDirection]], PacketQueue] | None = None,
     compute: ComputeTime | None = None,
 ) -> tuple[WorldEndpoint, CloudEndpoint, Teleop, VirtualRun]:
     """Build world, cloud and teleop, and connect them for a flight in virtual time.
 
-    The mission starts with the flight; `Teleop.over` tells when it is over. `make_loop`, `channel`
-    and `compute` are those of `build_cloud`. `queue` makes the queue of the packets in
+    The mission starts with the flight; `Teleop.over` tells when it is over. `make_loop`,
+    `transport` and `compute` are those of `build_cloud`. `queue` makes the queue of the packets in
     flight on the links.
     """
     from cloudrc.flight.drivers.faults import disturbed, faulty_clock
@@ -113,7 +113,7 @@ def assemble(
             lambda: now_ns,
             cpu_clock=CPU_CLOCK,
             make_loop=make_loop,
-            channel=channel,
+            transport=transport,
             compute=compute,
         )
 
@@ -163,13 +163,13 @@ def fly(
     except ControllerLostError as error:
         see([], [Fault(0, error.code, str(error))])
         raise
-    with way as channel:
-        _, _, teleop, run = assemble(experiment, channel=channel)
+    with way as transport:
+        _, _, teleop, run = assemble(experiment, transport=transport)
         lost = list[ControllerLostError]()
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
             see(from_world, run.on_world_clock(from_cloud))
-            if channel is not None:
+            if transport is not None:
                 lost.extend(lost_controller(from_cloud))
 
         limit_ns = round(flight_limit(experiment) * 1e9)
@@ -180,12 +180,12 @@ def fly(
 
 def _lock_step(
     experiment: ResolvedExperiment, gone: Callable[[], bool]
-) -> AbstractContextManager[ControllerChannel | None]:
+) -> AbstractContextManager[ControllerTransport | None]:
     """Connect to the program outside that controls the robot; without one, yield None."""
     controller = build_controller(experiment)
     if not isinstance(controller, OutsideController):
         return nullcontext()
-    connect = find_channel(controller.channel).get("lock_step")
+    connect = find_transport(controller.transport).get("lock_step")
     return closing(connect(controller.place, controller.start_limit, gone))
 
 
@@ -259,7 +259,7 @@ def build_cloud(
     *,
     cpu_clock: Callable[[], int] | None = None,
     make_loop: Callable[..., ControlLoop] = ControlLoop,
-    channel: ControllerChannel | None = None,
+    transport: ControllerTransport | None = None,
     compute: ComputeTime | None = None,
     make_worker: Callable[[ComputeTime | None], Worker] = Here,
 ) -> CloudEndpoint:
@@ -268,7 +268,7 @@ def build_cloud(
     `teleop` provides the setpoints. `clock` returns cloud's monotonic time [ns]. In virtual time,
     `cpu_clock` returns the processor time of this thread [ns], which delays commands if
     `cloud.compute_measured` is set. `make_loop` is called in place of `ControlLoop`, for example to
-    make a loop that lies. `channel` leads to a program outside that controls the robot. `compute`
+    make a loop that lies. `transport` leads to a program outside that controls the robot. `compute`
     takes the place of the time that the experiment says. `make_worker` makes what calls the
     perception, whose emulated time it gets.
     """
@@ -278,8 +278,8 @@ def build_cloud(
     if experiment.robot.planar:
         controller = Planar(controller, cloud.controller.name)
     loop = _build_loop(experiment, controller, make_loop)
-    if remote is not None and channel is not None:
-        remote.connect(channel, loop.period_ns * 1e-9, loop.counts, lambda: loop.newest)
+    if remote is not None and transport is not None:
+        remote.connect(transport, loop.period_ns * 1e-9, loop.counts, lambda: loop.newest)
     measured = cpu_clock if cloud.compute_measured else None
     if compute is None:
         compute = build_compute_time(experiment, measured)

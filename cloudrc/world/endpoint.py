@@ -48,10 +48,10 @@ from cloudrc.wire.records import (
     TelemetrySent,
 )
 from cloudrc.wire.tunnel import codec
-from cloudrc.wire.tunnel.channel import REPEATED, USED
 from cloudrc.wire.tunnel.codec import DecodeError, Direction, Hello, Kind
 from cloudrc.wire.tunnel.end import Identity, TunnelEnd
 from cloudrc.wire.tunnel.handshake import ServerHandshake
+from cloudrc.wire.tunnel.window import REPEATED, USED
 from cloudrc.world.filming import Film
 from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.sensors import Sensors
@@ -355,7 +355,7 @@ class WorldEndpoint(TunnelEnd):
             self._queue(datagram)
 
     def _begin_epoch(self, cause: str) -> None:
-        self._channel.reset()
+        self._window.reset()
         self.robot.guard.forget_commands()
         self._waiting = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
@@ -438,7 +438,7 @@ class WorldEndpoint(TunnelEnd):
     ) -> None:
         """Simulate up to `world_ns` [ns], and offer a command to the guard."""
         robot = self.robot
-        outcome = self._channel.take(counter, bool(command.plan))
+        outcome = self._window.take(counter, bool(command.plan))
         if outcome != REPEATED:
             self._door.hear(now_ns)
         if outcome == USED:
@@ -452,7 +452,7 @@ class WorldEndpoint(TunnelEnd):
                 outcome = rejection or USED
         used = outcome == USED
         delay = (now_ns - command.stamp_ns) * 1e-9 if self._clock_is_shared else nan
-        if outcome != REPEATED or not self._channel.is_flooded:
+        if outcome != REPEATED or not self._window.is_flooded:
             fields = world_ns, False, epoch, counter, delay, used, NEVER_NS, 0, False
             self._records.append(_new(Arrival, fields))
         if used and robot.guard.state is TRACK:

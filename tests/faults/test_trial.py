@@ -12,7 +12,7 @@ from cloudrc.cloud.operator import EmergencyStopRepeater
 from cloudrc.teleop.service import MissionService
 from cloudrc.wire.messages import ZERO
 from cloudrc.wire.records import CommandApplied, SessionOpened
-from cloudrc.wire.tunnel.channel import LATE, USED, ReceiveWindow
+from cloudrc.wire.tunnel.window import LATE, USED, ReceiveWindow
 from cloudrc.world.guard import limits
 from cloudrc.world.guard.hold import PositionHold
 from cloudrc.world.guard.state import Guard

@@ -105,7 +105,7 @@ def test_no_interleaving_of_all_actions_reverts_a_command():
 
 
 def test_the_check_finds_reverted_commands(monkeypatch):
-    monkeypatch.setattr("cloudrc.wire.tunnel.channel.ReceiveWindow.take", lambda *_: "used")
+    monkeypatch.setattr("cloudrc.wire.tunnel.window.ReceiveWindow.take", lambda *_: "used")
     with pytest.raises(AssertionError):
         explore(BASIC, 4)
 

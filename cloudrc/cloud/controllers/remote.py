@@ -29,7 +29,7 @@ ROUNDING = 1e-6
 """Part of a period by which an answer may be younger than a whole period, and count as one [1]."""
 
 
-class ControllerChannel(Protocol):
+class ControllerTransport(Protocol):
     """The way to the program: in lock step in virtual time, through a process in real time."""
 
     def begin(self) -> None:
@@ -47,42 +47,42 @@ class OutsideController(Controller):
     """Asks a program for each command; stands still while it has no valid answer.
 
     Attributes:
-        channel: Name or path of the channel to the program: see `drivers.channels`.
+        transport: Name or path of the transport to the program: see `drivers.transports`.
         place: Where the program is: an address, or a namespace of ROS.
         start_limit: Time limit for the first answer of an episode [s].
         surroundings: What there is to know besides estimate and setpoint.
     """
 
-    channel = "remote"
+    transport = "remote"
 
     def __init__(self, place: str, start_limit: float) -> None:
         self.place, self.start_limit = place, start_limit
         self.surroundings: Surroundings = lambda: (0, None, nan, 0.0)  # nothing is known
-        self._channel: ControllerChannel | None = None
+        self._transport: ControllerTransport | None = None
         self._period = 0.0
         self._counts: Counter[str] = Counter()
         self._flies = False
 
     def connect(
         self,
-        channel: ControllerChannel,
+        transport: ControllerTransport,
         period: float,
         counts: Counter[str],
         surroundings: Surroundings | None = None,
     ) -> None:
-        """Use `channel` for the flight.
+        """Use `transport` for the flight.
 
         `period` is the time between two commands [s]. Gaps between answers are counted in `counts`.
         """
         self.surroundings = surroundings or self.surroundings
-        self._channel, self._period, self._counts = channel, period, counts
+        self._transport, self._period, self._counts = transport, period, counts
         counts["controller_gaps"] += 0  # so that a recording tells that there was none
 
     def reset(self) -> None:
         """Begin an episode at the start of a session or mission."""
         self._flies = False
-        if self._channel is not None:
-            self._channel.begin()
+        if self._transport is not None:
+            self._transport.begin()
 
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput | None:
         """Return the command of the newest answer for this period; `dt` is the period [s].
@@ -90,9 +90,9 @@ class OutsideController(Controller):
         Raises:
             ControllerLostError: If the program is lost: the flight has to end.
         """
-        if self._channel is None:
+        if self._transport is None:
             return STAND_STILL
-        answer = self._channel.exchange(self.observe(estimate, setpoint, dt))
+        answer = self._transport.exchange(self.observe(estimate, setpoint, dt))
         if answer is None:
             self._counts["controller_gaps"] += self._flies
             self._flies = False

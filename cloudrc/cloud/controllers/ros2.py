@@ -18,7 +18,7 @@ from cloudrc.wire.messages import Odometry, Setpoint
 class RosController(OutsideController):
     """Asks a node of ROS 2; it also gets the odometry as it has arrived, delays and the time."""
 
-    channel = "ros2"
+    transport = "ros2"
 
     def observe(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> dict[str, Any]:
         """Return what the node gets to know; `dt` is the period [s]."""

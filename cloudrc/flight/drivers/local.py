@@ -302,7 +302,7 @@ class LocalRun:
             self._see(records)
             self._lost(records)
             if self._remote and self._gone():
-                from cloudrc.flight.drivers.channels.remote import tell_ended  # needs an extra
+                from cloudrc.flight.drivers.transports.remote import tell_ended  # needs an extra
 
                 tell_ended(sockets)
             now = self._clock()

@@ -68,12 +68,12 @@ class Programs:
         ended.
         """
         if self._tc is None:
-            channel, merged = subprocess.PIPE, subprocess.STDOUT
+            stream, merged = subprocess.PIPE, subprocess.STDOUT
             self._tc = subprocess.Popen(
                 _BATCH,
                 1,
-                stdin=channel,
-                stdout=channel,
+                stdin=stream,
+                stdout=stream,
                 stderr=merged,
                 text=True,
                 env=self._environment,

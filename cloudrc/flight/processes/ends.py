@@ -22,7 +22,6 @@ from cloudrc.config.load import load_experiment, read_experiment, robot_settings
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.flight import assembly
 from cloudrc.flight.drivers.background import Background
-from cloudrc.flight.drivers.channels import find_channel
 from cloudrc.flight.drivers.keyfile import KeyFile
 from cloudrc.flight.drivers.link_monitor import LinkMonitor
 from cloudrc.flight.drivers.machine import clock_id
@@ -30,6 +29,7 @@ from cloudrc.flight.drivers.process import EndProcess, Feed, GracefulStop, StopS
 from cloudrc.flight.drivers.readers import RecordSender
 from cloudrc.flight.drivers.realtime import Address, Peer, bind, show_address
 from cloudrc.flight.drivers.teleop import RemoteTeleop, UnixDatagrams, UnixPeer
+from cloudrc.flight.drivers.transports import find_transport
 from cloudrc.flight.processes.ports import ipv4_addresses, listening, open_exporter, repeat, warn
 from cloudrc.flight.runs.requirements import require
 from cloudrc.link.follow import PEER_PAUSE, PeerName
@@ -44,8 +44,8 @@ from cloudrc.wire.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES, Kind
 from cloudrc.wire.tunnel.end import Identity
 
 if TYPE_CHECKING:
-    from cloudrc.flight.drivers.channels.remote import RemoteLink
     from cloudrc.flight.drivers.recording import Recorder
+    from cloudrc.flight.drivers.transports.remote import RemoteLink
 
 TRACE_MAX = 2 << 20
 """Maximum size of a trace file whose name comes from the link process [bytes]. World and cloud do
@@ -98,7 +98,7 @@ def run_cloud(
     paths = teleop_folder / "cloud.sock", teleop_folder / "teleop.sock"
     with (
         closing(UnixPeer(*paths)) as peer,
-        _remote_link(experiment, teleop_folder) as channel,
+        _remote_link(experiment, teleop_folder) as transport,
         closing(RecordSender(records_folder or teleop_folder)) as readers,
     ):
         teleop = RemoteTeleop(peer, time.monotonic_ns())
@@ -107,7 +107,7 @@ def run_cloud(
             identity,
             teleop,
             time.monotonic_ns,
-            channel=channel,
+            transport=transport,
             make_worker=lambda extra: Background(extra.end if extra else None),
         )
         end.readers, cloud.watch = readers, readers.see
@@ -134,7 +134,7 @@ def _remote_link(experiment: ResolvedExperiment, folder: Path) -> Iterator[Remot
         yield None
         return
     require("a remote controller", ("policy",))
-    from cloudrc.flight.drivers.channels.remote import DATAGRAM_MAX, RemoteLink, sockets_of
+    from cloudrc.flight.drivers.transports.remote import DATAGRAM_MAX, RemoteLink, sockets_of
 
     with closing(UnixDatagrams(*sockets_of(folder), DATAGRAM_MAX)) as peer:
         period = 1.0 / experiment.cloud.command_rate_hz
@@ -149,7 +149,7 @@ def run_remote(
     `folder` has the sockets between cloud and the driver. A supervisor reads the feed if it is
     `watched`. `robot` is the number in a fleet.
     """
-    from cloudrc.flight.drivers.channels.remote import DATAGRAM_MAX, sockets_of
+    from cloudrc.flight.drivers.transports.remote import DATAGRAM_MAX, sockets_of
 
     feed = Feed.on_stdout(watched=watched)
     controller = assembly.build_controller(load_experiment(str(config), robot_settings(robot)))
@@ -160,7 +160,7 @@ def run_remote(
         def tell(text: str) -> None:
             feed.tell([Fault(time.monotonic_ns(), "controller_unstamped", text)])
 
-        connect = find_channel(controller.channel).get("driver")
+        connect = find_transport(controller.transport).get("driver")
         driver = connect(peer, controller.place, controller.start_limit, tell)
         driver.run(feed.alive_while(stop))
 

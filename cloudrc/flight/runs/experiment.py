@@ -15,10 +15,9 @@ from cloudrc.config.overrides import OUTSIDE, Settings, naming_settings, parse_s
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import has_mujoco
-from cloudrc.config.schema import Parameters
-from cloudrc.config.world import ResolvedWorld
-from cloudrc.flight.drivers.channels import find_channel
+from cloudrc.config.schema import Parameters, World
 from cloudrc.flight.drivers.machine import usable_cores
+from cloudrc.flight.drivers.transports import find_transport
 from cloudrc.flight.runs.requirements import require
 from cloudrc.flight.sensing import describe_camera
 from cloudrc.flight.warnings import advise
@@ -118,7 +117,7 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
             text = f"{controller} flies on this machine only; use --mode virtual or local"
             raise problem_at("cloud.controller", text)
         require("a remote controller", ("policy",))
-        find_channel(controller).get("check")()
+        find_transport(controller).get("check")()
 
 
 def check_world(world: ResolvedWorld, *, turns: bool = False) -> None:

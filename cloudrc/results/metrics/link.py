@@ -23,7 +23,7 @@ SENDER = {"uplink": "world", "downlink": "cloud"}
 """Direction -> the end that sends in this direction."""
 WINDOW_MAX = 1024
 """A missing datagram counts as lost after this number of newer datagrams; the receiver accepts
-no older one, whether it is new or repeated (`cloudrc.wire.tunnel.channel.WINDOW`)."""
+no older one, whether it is new or repeated (`cloudrc.wire.tunnel.window.WINDOW`)."""
 
 
 def _late(flight: Flight, way: str) -> float | None:

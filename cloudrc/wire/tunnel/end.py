@@ -12,7 +12,6 @@ from typing import Any
 from cloudrc.wire.messages import Command, Datagram, FramePiece, Passed, RangeScan, Telemetry
 from cloudrc.wire.records import Fault, FaultCode, Record
 from cloudrc.wire.tunnel import codec
-from cloudrc.wire.tunnel.channel import ReceiveWindow
 from cloudrc.wire.tunnel.codec import (
     Direction,
     encode_command,
@@ -23,6 +22,7 @@ from cloudrc.wire.tunnel.codec import (
 from cloudrc.wire.tunnel.handshake import KEY_TEXT, VERSION_TEXT
 from cloudrc.wire.tunnel.keys import KeyRing
 from cloudrc.wire.tunnel.session import Session
+from cloudrc.wire.tunnel.window import ReceiveWindow
 
 _ENCODERS: dict[type, Callable[[Any], bytes]] = {
     Telemetry: encode_telemetry,
@@ -56,7 +56,7 @@ class TunnelEnd:
         self._identity, self.counts = identity, counts
         self._session = Session(sends, identity.ring)
         self._make_datagram = self._session.pass_on if identity.passes else self._encode
-        self._channel = ReceiveWindow(newest_wins)
+        self._window = ReceiveWindow(newest_wins)
         self._told: set[str] = set()  # texts of the faults in this session
         self._clock_is_shared = False
         self._datagrams: list[Datagram] = []

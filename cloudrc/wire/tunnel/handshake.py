@@ -23,9 +23,9 @@ from collections import deque
 from typing import NamedTuple
 
 from cloudrc.wire.tunnel import codec
-from cloudrc.wire.tunnel.channel import REPEATED, ReceiveWindow
 from cloudrc.wire.tunnel.codec import Accept, DecodeError, Hello, Kind
 from cloudrc.wire.tunnel.session import NO_EPOCH, Session
+from cloudrc.wire.tunnel.window import REPEATED, ReceiveWindow
 
 EPOCH_MAX = 2**32 - 1  # largest session number that the header can hold; the next number is 1
 CHALLENGE_NS = 100_000_000  # shortest time between two challenges [ns]

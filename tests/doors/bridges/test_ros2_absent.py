@@ -37,13 +37,13 @@ def test_without_ros_a_flight_is_refused_before_a_folder_is_made(tmp_path, monke
 @pytest.mark.parametrize("lack", ["entry point", "module"])
 def test_without_the_bridge_a_line_names_its_extra(lack, tmp_path, monkeypatch, capsys):
     if lack == "module":
-        monkeypatch.setitem(sys.modules, "cloudrc.doors.bridges.ros2.channel", None)
+        monkeypatch.setitem(sys.modules, "cloudrc.doors.bridges.ros2.transport", None)
     else:
         monkeypatch.syspath_prepend(tmp_path)  # another search path is searched anew
         monkeypatch.setattr(plugins, "_declared", lambda path: "")
     assert main(["run", "paper", "--mode", "virtual", "--set", "cloud.controller=ros2"]) == 3
     (error,) = capsys.readouterr().err.splitlines()
-    assert "channel" in error
+    assert "transport" in error
     assert "pip install 'cloudrc[policy]'" in error
 
 

@@ -50,7 +50,7 @@ def key(write_sweep):
 
 
 def test_what_cloudrc_brings_itself_is_no_plug_in_of_another_package():
-    assert "ros2" in plugins.names("channels")
+    assert "ros2" in plugins.names("transports")
     assert installed_plugins() == {}
 
 

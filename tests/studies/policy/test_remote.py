@@ -12,9 +12,9 @@ from cloudrc.base.errors import BadInputError, ControllerLostError
 from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.config.load import load_experiment
 from cloudrc.flight import assembly
-from cloudrc.flight.drivers.channels import remote
 from cloudrc.flight.drivers.openpi.codec import unpack
 from cloudrc.flight.drivers.realtime import free_ports
+from cloudrc.flight.drivers.transports import remote
 from cloudrc.flight.runs.experiment import check_mode
 from cloudrc.flight.runs.fly import fly
 from cloudrc.results.record.columns import Recording, RecordStore

@@ -54,7 +54,7 @@ SILENT, INVALID = CONTROLLER_LOST
 
 
 def check() -> None:
-    """Raise nothing: the extra `policy` is all that this channel needs."""
+    """Raise nothing: the extra `policy` is all that this transport needs."""
 
 
 def lock_step(url: str, start_limit: float, gone: Callable[[], bool]) -> LockStep:

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Channels to programs outside that control the robot.
+"""Transports to programs outside that control the robot.
 
-A channel is a plug-in of the kind `channels`: a file here, or a module that an entry point in the
-group `cloudrc.channels` names. It defines:
+A transport is a plug-in of the kind `transports`: a file here, or a module that an entry point in
+the group `cloudrc.transports` names. It defines:
 
-- `check()` raises a MissingPrerequisiteError if this machine lacks what the channel needs;
-- `lock_step(place, start_limit, gone)` connects in virtual time, and returns a `ControllerChannel`
-  of `cloud.controllers.remote` with a method `close()`;
+- `check()` raises a MissingPrerequisiteError if this machine lacks what the transport needs;
+- `lock_step(place, start_limit, gone)` connects in virtual time, and returns a
+  `ControllerTransport` of `cloud.controllers.remote` with a method `close()`;
 - `driver(peer, place, start_limit, tell)` connects in real time, in a process beside cloud; the
   method `run(stop)` of what it returns serves cloud by `peer` until `stop()` is true.
 
@@ -21,13 +21,13 @@ from cloudrc.base import plugins
 from cloudrc.base.errors import CloudrcError, MissingPrerequisiteError
 
 
-def find_channel(name: str) -> plugins.Found:
-    """Import a channel by name or path.
+def find_transport(name: str) -> plugins.Found:
+    """Import a transport by name or path.
 
     The error about a name that is not installed tells the extra that installs it.
     """
     try:
-        return plugins.find("channels", name)
+        return plugins.find("transports", name)
     except CloudrcError as error:
         if plugins.is_path(name):
             raise

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The channel to a user's node; an entry point in pyproject.toml names this file."""
+"""The transport to a user's node; an entry point in pyproject.toml names this file."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.wire.tunnel.channel import LATE, REPEATED, USED, WINDOW, ReceiveWindow
+from cloudrc.wire.tunnel.window import LATE, REPEATED, USED, WINDOW, ReceiveWindow
 
 
 def expected(counter, seen, newest_wins):
@@ -17,9 +17,9 @@ def expected(counter, seen, newest_wins):
 
 
 def compare(counters, newest_wins):
-    channel, seen = ReceiveWindow(newest_wins), set[int]()
+    window, seen = ReceiveWindow(newest_wins), set[int]()
     for counter in counters:
-        assert channel.take(counter) == expected(counter, seen, newest_wins)
+        assert window.take(counter) == expected(counter, seen, newest_wins)
         seen.add(counter)
 
 
@@ -29,11 +29,11 @@ def test_the_window_ends_where_it_says(ahead):
 
 
 def test_a_plan_is_late_after_a_newer_command_in_any_order():
-    channel = ReceiveWindow(newest_wins=False)
-    assert [channel.take(n, newest_wins=True) for n in (3, 2, 2, 4)] == [
+    window = ReceiveWindow(newest_wins=False)
+    assert [window.take(n, newest_wins=True) for n in (3, 2, 2, 4)] == [
         *("used", "late", "repeated", "used"),
     ]
-    assert channel.take(1) == "used"
+    assert window.take(1) == "used"
 
 
 @given(st.lists(st.integers(0, 40) | st.integers(1000, 1070), max_size=60), st.booleans())
@@ -43,12 +43,12 @@ def test_the_window_agrees_with_a_set(counters, newest_wins):
 
 
 def test_more_repeated_than_new_datagrams_are_a_flood():
-    channel = ReceiveWindow(newest_wins=True)
+    window = ReceiveWindow(newest_wins=True)
     flooded = []
     for counter in (0, 1, 0, 1, 0, 2, 2):  # a link that doubles everything, and more
-        channel.take(counter)
-        flooded.append(channel.is_flooded)
+        window.take(counter)
+        flooded.append(window.is_flooded)
     assert flooded == [False, False, False, False, True, False, True]
-    channel.reset()
-    assert not channel.is_flooded
-    assert channel.take(0) == USED, "a new epoch forgets all counters"
+    window.reset()
+    assert not window.is_flooded
+    assert window.take(0) == USED, "a new epoch forgets all counters"

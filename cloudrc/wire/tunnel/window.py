@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 WINDOW = 1024
-"""Number of counters, up to the newest, for which a channel remembers whether the datagram has
+"""Number of counters, up to the newest, for which a window remembers whether the datagram has
 arrived. A datagram with an older counter counts as repeated."""
 _MASK = (1 << WINDOW) - 1
 
@@ -43,7 +43,7 @@ class ReceiveWindow:
         """Classify the datagram with this counter as USED, LATE or REPEATED.
 
         With `newest_wins` = True, a datagram that arrives after a newer datagram is LATE, whatever
-        the channel's rule.
+        the rule of the window.
         """
         ahead = counter - self._newest
         if ahead > 0:
