@@ -18,6 +18,7 @@ from typing import Any
 
 from cloudrc.base.errors import ControllerLostError
 from cloudrc.cloud.compute_time import ComputeTime
+from cloudrc.cloud.frame_receiver import FrameReceiver
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import (
     EmergencyStopRepeater,
@@ -26,8 +27,7 @@ from cloudrc.cloud.operator import (
     make_robot_status,
 )
 from cloudrc.cloud.perceiving import Perceiver
-from cloudrc.cloud.receiving import FrameReceiver
-from cloudrc.cloud.sight import KINDS, Sight
+from cloudrc.cloud.sensor_receiver import KINDS, SensorReceiver
 from cloudrc.wire.messages import (
     NEVER_NS,
     Datagram,
@@ -113,8 +113,8 @@ class CloudEndpoint(TunnelEnd):
             identity: Identity and keys of this end.
             newest_wins: Whether to drop telemetry that arrives after newer telemetry.
             compute: The simulated time between computation and departure of a command; None: 0.
-            perceiver: As `Sight` takes it.
-            frames: As `Sight` takes it.
+            perceiver: As `SensorReceiver` takes it.
+            frames: As `SensorReceiver` takes it.
             start_ns: The present time on cloud's monotonic clock [ns].
             on_arrival: Whether newer telemetry, and not a period, makes a command due.
         """
@@ -123,7 +123,7 @@ class CloudEndpoint(TunnelEnd):
         self._handshake = ClientHandshake(identity.nonce, identity.clock_id)
         self._hellos = 0
         self._setpoint: Setpoint | None = None
-        self._perceiver, self.sight = perceiver, Sight(perceiver, frames, loop.counts)
+        self._perceiver, self.sensors = perceiver, SensorReceiver(perceiver, frames, loop.counts)
         self._world = ""  # identifies the world process of the session
         self.watch: Callable[[int, int, Telemetry], None] | None = None
         self._control: Control | None = None  # record of the session's last command
@@ -253,7 +253,7 @@ class CloudEndpoint(TunnelEnd):
             if kind == TELEMETRY:
                 self._receive_telemetry(epoch, counter, body, now_ns)
             elif kind in KINDS:
-                self._records += self.sight.receive(kind, epoch, counter, body, now_ns)
+                self._records += self.sensors.receive(kind, epoch, counter, body, now_ns)
             elif kind == Kind.ACCEPT:
                 self._receive_accept(epoch, Accept(*codec.decode(Kind.ACCEPT, body)), now_ns)
             elif kind == Kind.CHALLENGE:
@@ -317,7 +317,7 @@ class CloudEndpoint(TunnelEnd):
         self._session.begin(epoch, nonces, self._session.greeting_key)
         self._told.clear()
         self._window.reset()
-        self.sight.begin_session(epoch)
+        self.sensors.begin_session(epoch)
         self._loop.reset(now_ns)
         self._setpoint = None  # the robot may have moved; teleop sends a new one
         self._control, self._uplink_delay = None, nan

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from cloudrc.base.outside.code import attempt
 from cloudrc.base.outside.values import RESULT, InvalidValueError, shorten
 from cloudrc.cloud.compute_time import ComputeTime
-from cloudrc.cloud.perceptions import Frame, Perception, Scan, Seen
+from cloudrc.cloud.perceptions import Frame, Perception, Scan
 from cloudrc.cloud.results import to_vector
 from cloudrc.physics.geometry.fence import Fence
 from cloudrc.physics.geometry.rays import ranges_of
@@ -81,10 +81,10 @@ def judge(result: Any, low: Vector, high: Vector) -> Setpoint:
     )
 
 
-class _Look(NamedTuple):
-    """Something seen, at which the perception looks or is about to."""
+class _Input(NamedTuple):
+    """A scan or picture at which the perception looks or is about to."""
 
-    seen: Seen
+    seen: Scan | Frame
     arrived_ns: int  # cloud's clock
     mission: int = 0  # number of the mission in which the look has begun
 
@@ -117,8 +117,8 @@ class Perceiver:
         self.records, self.counts = list[Perceived](), Counter(seen_dropped=0)
         self._mission, self._is_fresh = 0, True
         self._odometry = list[Odometry]()  # that has arrived, oldest first
-        self._waiting: _Look | None = None
-        self._looking: _Look | None = None
+        self._waiting: _Input | None = None
+        self._looking: _Input | None = None
         self._outcome: Outcome | None = None  # of `_looking`, even if it is over later
         self._setpoint: Setpoint | None = None
         self._steered: Setpoint | None = None  # the same, with teleop's marks
@@ -155,12 +155,12 @@ class Perceiver:
         if self._perception.takes == "camera":
             self.receive(frame, now_ns)
 
-    def receive(self, seen: Seen, now_ns: int) -> None:
+    def receive(self, seen: Scan | Frame, now_ns: int) -> None:
         """Look at something that arrived at `now_ns` [ns], cloud's clock, at once or later."""
         self.advance(now_ns)
         if self._waiting is not None:
             self._drop()
-        self._waiting = _Look(seen, now_ns)
+        self._waiting = _Input(seen, now_ns)
         self._begin(now_ns)
 
     def advance(self, now_ns: int) -> None:
@@ -170,9 +170,9 @@ class Perceiver:
                 self._outcome = self._worker.take()
             if self._outcome is None or self._outcome.done_ns > now_ns:
                 return
-            outcome, look = self._outcome, self._looking
+            outcome, given = self._outcome, self._looking
             self._outcome = self._looking = None
-            self._finish(look, outcome, now_ns)
+            self._finish(given, outcome, now_ns)
             self._begin(outcome.done_ns)
 
     def steer(self, given: Setpoint, now_ns: int) -> Setpoint:
@@ -204,36 +204,36 @@ class Perceiver:
         """Begin with what waits at `now_ns` [ns], if the perception is free."""
         if self._waiting is None or self._looking is not None:
             return
-        look, self._waiting = self._waiting, None
-        stamp_ns = look.seen.stamp_ns
+        given, self._waiting = self._waiting, None
+        stamp_ns = given.seen.stamp_ns
         known = [each for each in self._odometry if each.stamp_ns <= stamp_ns]
         if not known:  # telemetry is late, or lost
             self._drop()
             return
-        self._looking = look._replace(mission=self._mission)
+        self._looking = given._replace(mission=self._mission)
         is_fresh, self._is_fresh = self._is_fresh, False
-        self._worker.begin(partial(self._see, look.seen, known[-1], reset=is_fresh), now_ns)
+        self._worker.begin(partial(self._see, given.seen, known[-1], reset=is_fresh), now_ns)
 
     def _drop(self) -> None:
         self.counts.update(seen_dropped=1)
 
-    def _see(self, seen: Seen, odometry: Odometry, *, reset: bool) -> Setpoint | None:
+    def _see(self, seen: Scan | Frame, odometry: Odometry, *, reset: bool) -> Setpoint | None:
         """Let the perception look, in whichever thread; judge what it returns."""
         if reset:
             self._perception.reset()
         result = self._perception.see(seen, odometry)
         return None if result is None else judge(result, self._low, self._high)
 
-    def _finish(self, look: _Look, outcome: Outcome, now_ns: int) -> None:
+    def _finish(self, given: _Input, outcome: Outcome, now_ns: int) -> None:
         """Take over the setpoint of a look that is over, unless another mission flies."""
         setpoint: Setpoint | None = outcome.result
         if outcome.error is not None:
             self._note_failure(outcome.error)
         begun_ns, done_ns = outcome.begun_ns, outcome.done_ns
-        times = begun_ns - look.arrived_ns, done_ns - begun_ns, done_ns
+        times = begun_ns - given.arrived_ns, done_ns - begun_ns, done_ns
         place = NOWHERE if setpoint is None else setpoint.position
-        made = Perceived(0, look.seen.stamp_ns, *times, NO_EPOCH, UNSENT, place)
-        if setpoint is None or look.mission != self._mission:
+        made = Perceived(0, given.seen.stamp_ns, *times, NO_EPOCH, UNSENT, place)
+        if setpoint is None or given.mission != self._mission:
             self._record(made, now_ns)
             return
         if self._news is not None:  # teleop steers meanwhile

@@ -63,7 +63,7 @@ class CellConfig(Section):
     """Which packet leaves next. fifo: the oldest; drr: those of all robots in turn (deficit round
     robin); priority: those of robots before other traffic and before pictures of cameras; newest:
     as fifo, but a packet replaces the waiting one of the same robot and kind, so that no command
-    waits behind an older one; pieces of pictures replace nothing"""
+    waits behind an older one; fragments of pictures replace nothing"""
     queue_packets: Annotated[int, Field(ge=1)] = 50
     """Largest number of packets in a queue; further packets are dropped. A queue holds the packets
     of all, with drr those of a robot, with priority those of all robots, or of other traffic and

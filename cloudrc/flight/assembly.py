@@ -39,7 +39,7 @@ from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.flight.drivers.transports import find_transport
 from cloudrc.flight.legs import LEG_FACTOR, leg_to, step_legs
-from cloudrc.flight.sensing import build_film, build_receiver, build_scanner, build_target
+from cloudrc.flight.sensing import build_frame_source, build_receiver, build_scanner, build_target
 from cloudrc.link.cell import FRAME_NS, Bulk, Cell, Video
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DIRECTIONS
@@ -246,7 +246,7 @@ def build_world(
         odometry_period_ns=SECOND_NS // world.odometry_rate_hz,
         start_ns=clock(),
         scanner=build_scanner(experiment, robot, generator(seed, "scan noise", experiment.stream)),
-        film=build_film(experiment, robot, make_worker),
+        frame_source=build_frame_source(experiment, robot, make_worker),
         target=build_target(experiment, robot),
     )
 

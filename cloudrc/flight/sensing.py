@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cloudrc.cloud.receiving import FrameReceiver
+from cloudrc.cloud.frame_receiver import FrameReceiver
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.wire.endpoint import Worker
 from cloudrc.wire.pictures import Image, as_png, describe_codec, make_decoder, make_encoder
@@ -18,7 +18,7 @@ from cloudrc.wire.pictures import Image, as_png, describe_codec, make_decoder, m
 if TYPE_CHECKING:
     from cloudrc.physics.sim.scan import Scanner
     from cloudrc.physics.sim.target import MovingTarget
-    from cloudrc.world.filming import Film
+    from cloudrc.world.frame_source import FrameSource
     from cloudrc.world.robot import Robot
 
 
@@ -34,9 +34,9 @@ def build_scanner(
     return Scanner(robot.simulator.model, robot.simulator.data, scan, errors)
 
 
-def build_film(
+def build_frame_source(
     experiment: ResolvedExperiment, robot: Robot, make_worker: Callable[[], Worker] | None
-) -> Film | None:
+) -> FrameSource | None:
     """Build what takes pictures, if the robot's camera works in the experiment.
 
     `make_worker` makes what renders beside world; None: rendering takes no time.
@@ -48,12 +48,12 @@ def build_film(
     if codec is None or config is None:
         return None
     from cloudrc.physics.sim.camera import Camera
-    from cloudrc.world.filming import Film
+    from cloudrc.world.frame_source import FrameSource
 
     camera = Camera(robot.simulator.model, robot.simulator.data, config)
     kind = config.width, config.height, config.fps
     worker = make_worker() if make_worker is not None else None
-    return Film(
+    return FrameSource(
         camera,
         lambda: (make_encoder(codec, *kind), make_decoder(codec.codec)),
         worker,

@@ -18,21 +18,21 @@ import numpy as np
 from gymnasium import spaces
 
 from cloudrc.base.outside.values import to_arrays
+from cloudrc.cloud.frame_receiver import FrameReceiver
 from cloudrc.cloud.perceptions import Frame
-from cloudrc.cloud.receiving import FrameReceiver
 from cloudrc.config.camera import CodecConfig
 from cloudrc.gym.executors import Committed
 from cloudrc.gym.lane import Wire
 from cloudrc.gym.values import copied, size_of
-from cloudrc.wire.messages import FramePiece
-from cloudrc.wire.pictures import Encoded, make_decoder, make_encoder
+from cloudrc.wire.messages import Fragment
+from cloudrc.wire.pictures import EncodedFrame, make_decoder, make_encoder
 
 
 class Coded(NamedTuple):
     """An observation as it travels."""
 
     number: int  # of those that the robot has sent in the episode
-    images: tuple[Encoded, ...]
+    images: tuple[EncodedFrame, ...]
     rest: Any  # the observation, with () in place of its images
     size: int  # [bytes]
 
@@ -114,7 +114,7 @@ class ObservationCodec:
 
     def encode(self, observation: Any) -> Coded:
         """Encode the next observation that the robot sends."""
-        images, encoders = list[Encoded](), iter(self._encoders)
+        images, encoders = list[EncodedFrame](), iter(self._encoders)
 
         def take(image: Any) -> tuple[()]:
             plain = np.ascontiguousarray(to_arrays(image))
@@ -132,8 +132,9 @@ class ObservationCodec:
         coded: Coded = message[2]
         self._waiting[coded.number] = message
         every = list[list[Frame]]()
-        for receiver, (data, key) in zip(self._receivers, coded.images, strict=True):
-            every.append(receiver.receive(FramePiece(0, coded.number, 0, 1, key, data), 0))
+        for receiver, image in zip(self._receivers, coded.images, strict=True):
+            whole = Fragment(0, coded.number, 0, 1, image.key, image.data)
+            every.append(receiver.receive(whole, 0))
             receiver.take_records()
         return [self._decoded(frames) for frames in zip(*every, strict=True)]
 

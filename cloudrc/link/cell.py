@@ -25,7 +25,7 @@ Source: M. Shreedhar, G. Varghese, "Efficient fair queueing using deficit round 
 FRAME_NS, VIDEO_BYTES = 33_333_333, 1228
 """Time between two frames of a video [ns], and size of its packets with headers [bytes]."""
 PICTURE = 10
-"""Kind of the packets with pieces of a robot's pictures, `tunnel.codec.Kind.FRAME`."""
+"""Kind of the packets with fragments of a robot's pictures, `tunnel.codec.Kind.FRAME`."""
 BULK_BYTES, ROUND_TRIP_NS, WINDOW_MAX = 1500, 40_000_000, 2000.0
 """Size of a packet of a bulk flow with headers [bytes]; time from its departure to its confirmation
 [ns]; largest number of its packets under way."""

@@ -157,17 +157,17 @@ class RangeScan(NamedTuple):
     millimetres: tuple[int, ...]  # a distance per ray, from right to left; 0: nothing within range
 
 
-PIECE_MAX = 1151
-"""Largest piece of a picture: with header and tag its datagram has 1,200 bytes [bytes]."""
+FRAGMENT_MAX = 1151
+"""Largest fragment of a picture: with header and tag its datagram has 1,200 bytes [bytes]."""
 
 
-class FramePiece(NamedTuple):
-    """Message from world to cloud: a piece of a picture of the robot's camera, as it is encoded."""
+class Fragment(NamedTuple):
+    """Message from world to cloud: a part of an encoded picture of the robot's camera."""
 
     stamp_ns: int  # time at which the picture was taken [ns], world's clock
     number: int  # of the picture in its session, from 0 on
-    piece: int  # of the picture, from 0 on
-    pieces: int  # of which the picture consists
+    fragment: int  # its number in the picture, from 0 on
+    fragments: int  # of which the picture consists
     key: bool  # whether the picture needs none before it
     data: bytes
 

@@ -5,13 +5,16 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from fractions import Fraction
+from math import nan
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.base.errors import MissingPrerequisiteError
+from cloudrc.wire.messages import FRAGMENT_MAX, Fragment
 
 if TYPE_CHECKING:
     from cloudrc.config.camera import CodecConfig
@@ -21,17 +24,28 @@ Image: TypeAlias = NDArray[np.uint8]
 LACKS = "{} needs {} (not installed); run: pip install 'cloudrc[camera]'"
 
 
-class Encoded(NamedTuple):
-    """A picture as it travels."""
+class EncodedFrame(NamedTuple):
+    """A picture as it travels; its encoder knows only the data, and whether it is a key frame."""
 
     data: bytes
     key: bool  # whether it can be decoded without those before it
+    stamp_ns: int = 0  # time at which it was taken [ns], world's clock
+    number: int = 0  # in its session
+    psnr: float = nan  # of what a receiver decodes [dB]
+    encode_ns: int = 0  # time that rendering and encoding took [ns]
+
+    def fragments(self) -> Iterator[Fragment]:
+        """Cut the data."""
+        cuts = range(0, len(self.data), FRAGMENT_MAX)
+        for place, at in enumerate(cuts):
+            part = self.data[at : at + FRAGMENT_MAX]
+            yield Fragment(self.stamp_ns, self.number, place, len(cuts), self.key, part)
 
 
 class Encoder(Protocol):
     """Encodes the pictures of a session, one after the other."""
 
-    def encode(self, image: Image) -> Encoded:
+    def encode(self, image: Image) -> EncodedFrame:
         """Encode the next picture."""
 
 
@@ -50,9 +64,9 @@ class Jpeg:
         self._quality = quality
         _pillow()  # a lack is told here; an attribute of a module could not be copied
 
-    def encode(self, image: Image) -> Encoded:
+    def encode(self, image: Image) -> EncodedFrame:
         """Encode a picture."""
-        return Encoded(_written(_pillow(), image, "JPEG", quality=self._quality), True)
+        return EncodedFrame(_written(_pillow(), image, "JPEG", quality=self._quality), True)
 
     def decode(self, data: bytes) -> Image | None:
         """Decode a picture."""
@@ -80,13 +94,13 @@ class H264Encoder:
         }
         self._count = 0
 
-    def encode(self, image: Image) -> Encoded:
+    def encode(self, image: Image) -> EncodedFrame:
         """Encode the next picture."""
         frame = self._av.VideoFrame.from_ndarray(image, format="rgb24")
         frame.pts, self._count = self._count, self._count + 1
         packets = self._context.encode(frame)
         key = any(packet.is_keyframe for packet in packets)
-        return Encoded(b"".join(map(bytes, packets)), key)
+        return EncodedFrame(b"".join(map(bytes, packets)), key)
 
 
 class H264Decoder:

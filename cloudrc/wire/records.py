@@ -172,7 +172,7 @@ class ScanTaken(NamedTuple):
 class FrameSent(NamedTuple):
     """Made by world: a picture of the robot's camera was sent. Topic /frame.
 
-    Its stamp is when its pieces were sent. In virtual time, rendering and encoding take no time.
+    Its stamp is when its fragments were sent. In virtual time, rendering and encoding take no time.
     """
 
     stamp_ns: int
@@ -180,7 +180,7 @@ class FrameSent(NamedTuple):
     number: Annotated[int, "", "of the picture in its session"]
     taken_ns: Annotated[int, "ns", "time at which it was taken, world's clock"]
     encode_ns: Annotated[int, "ns", "duration of rendering and encoding it"]
-    counter: Annotated[int, "", "counter of its first datagram, one for each piece"]
+    counter: Annotated[int, "", "counter of its first datagram, one for each fragment"]
     pieces: Annotated[int, "", "number of its datagrams"]
     size: Annotated[int, "bytes", "of the encoded picture"]
     key: Annotated[bool, "", "true if it needs no picture before it"]
@@ -194,7 +194,9 @@ class FrameShown(NamedTuple):
     epoch: Epoch
     number: Annotated[int, "", "of the picture in its session"]
     taken_ns: Annotated[int, "ns", "time at which it was taken, world's clock"]
-    wait_ns: Annotated[int, "ns", "from the arrival of its last piece until the stamp of the row"]
+    wait_ns: Annotated[
+        int, "ns", "from the arrival of its last fragment until the stamp of the row"
+    ]
 
 
 class FrameKept(NamedTuple):

@@ -52,7 +52,7 @@ from cloudrc.wire.tunnel.codec import DecodeError, Direction, Hello, Kind
 from cloudrc.wire.tunnel.end import Identity, TunnelEnd
 from cloudrc.wire.tunnel.handshake import ServerHandshake
 from cloudrc.wire.tunnel.window import REPEATED, USED
-from cloudrc.world.filming import Film
+from cloudrc.world.frame_source import FrameSource
 from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.sensors import Sensors
 
@@ -88,7 +88,7 @@ class WorldEndpoint(TunnelEnd):
         odometry_period_ns: int = ODOMETRY_PERIOD_NS,
         start_ns: int = 0,
         scanner: Scanner | None = None,
-        film: Film | None = None,
+        frame_source: FrameSource | None = None,
         target: MovingTarget | None = None,
     ) -> None:
         """Connect a robot that is switched off to the tunnel; there is no session yet.
@@ -96,7 +96,8 @@ class WorldEndpoint(TunnelEnd):
         With `newest_wins`, a command that arrives after a newer command is dropped.
         `odometry_period_ns` is the time between two odometry samples [ns], a multiple of the step.
         `start_ns` is the present time on the monotonic clock [ns]. Without a `scanner`, no scans
-        are sent, and without a `film` no pictures. `target` is a body of the scene that moves.
+        are sent, and without a `frame_source` no pictures. `target` is a body of the scene that
+        moves.
         """
         super().__init__(identity, Direction.UPLINK, robot.guard.counts, newest_wins=newest_wins)
         self.robot, self._sensors = robot, sensors
@@ -109,8 +110,8 @@ class WorldEndpoint(TunnelEnd):
         self._odometry_period_ns = odometry_period_ns
         self._sample_period_ns = min(odometry_period_ns, ODOMETRY_PERIOD_NS)
         self._count_ns, self._session_ns = start_ns + COUNT_PERIOD_NS, start_ns
-        self._scanner, self._film, self._target = scanner, film, target
-        self._senses = scanner is not None or film is not None
+        self._scanner, self._frame_source, self._target = scanner, frame_source, target
+        self._senses = scanner is not None or frame_source is not None
         self._scans = self._frames = 0  # that were due in this session
         self._scan_ns = self._frame_ns = NEVER_DUE_NS
         self._counted_slip_ns: int | None = None
@@ -138,8 +139,8 @@ class WorldEndpoint(TunnelEnd):
         """Simulate up to `now_ns` [ns]; send the telemetry that is due."""
         self._session.follow_keys()
         self._advance(self._follow(now_ns), samples=True)
-        if self._film is not None:
-            self._send_picture(self._film)
+        if self._frame_source is not None:
+            self._send_frame(self._frame_source)
 
     def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Handle a datagram that arrived at `now_ns` [ns]; count and drop an invalid datagram."""
@@ -149,8 +150,8 @@ class WorldEndpoint(TunnelEnd):
             if kind == COMMAND:
                 command = codec.decode_command(body) if type(body) is bytes else body
                 self._receive_command(epoch, counter, command, now_ns, world_ns)
-                if self._film is not None:
-                    self._send_picture(self._film)
+                if self._frame_source is not None:
+                    self._send_frame(self._frame_source)
             elif kind == Kind.HELLO:
                 self._advance(world_ns)
                 self._receive_hello(Hello(*codec.decode(Kind.HELLO, body)), counter, now_ns)
@@ -259,29 +260,30 @@ class WorldEndpoint(TunnelEnd):
             self._scans += 1
             self._scan_ns = self._due_ns(self._scans, self._scanner.config.rate_hz)
             self._scan(self._scanner, now_ns)
-        if self._film is not None and now_ns >= self._frame_ns:
+        if self._frame_source is not None and now_ns >= self._frame_ns:
             self._frames += 1
-            self._frame_ns = self._due_ns(self._frames, self._film.rate_hz)
+            self._frame_ns = self._due_ns(self._frames, self._frame_source.rate_hz)
             if self._target is not None:
                 self._target.move(now_ns)
-            self._film.take(now_ns)
-            self._send_picture(self._film)
+            self._frame_source.take(now_ns)
+            self._send_frame(self._frame_source)
         self._look_ns = min(self._sample_ns, self._scan_ns, self._frame_ns)
 
     def _due_ns(self, number: int, rate_hz: int) -> int:
         """Return the first physics step of a period of the session [ns]."""
         return self._session_ns + -(-number * 1_000_000_000 // (rate_hz * STEP_NS)) * STEP_NS
 
-    def _send_picture(self, film: Film) -> None:
-        """Send the picture that is ready, if there is one, piece by piece."""
-        if (picture := film.finished()) is None:
+    def _send_frame(self, source: FrameSource) -> None:
+        """Send the frame that is ready, if there is one, a fragment per datagram."""
+        if (frame := source.finished()) is None:
             return
-        counter, pieces = self._session.next_counter(FRAME), [*picture.pieces()]
-        for piece in pieces:
-            self._queue(self._make_datagram(FRAME, piece))
-        epoch, (data, key) = self._session.epoch, picture.encoded
-        which = self._tick_ns, epoch, picture.number, picture.stamp_ns, picture.encode_ns
-        self._records.append(FrameSent(*which, counter, len(pieces), len(data), key, picture.psnr))
+        counter, fragments = self._session.next_counter(FRAME), [*frame.fragments()]
+        for fragment in fragments:
+            self._queue(self._make_datagram(FRAME, fragment))
+        which = self._tick_ns, self._session.epoch, frame.number, frame.stamp_ns, frame.encode_ns
+        size = len(frame.data)
+        sent = FrameSent(*which, counter, len(fragments), size, frame.key, frame.psnr)
+        self._records.append(sent)
 
     def _scan(self, scanner: Scanner, now_ns: int) -> None:
         """Scan and send the distances."""
@@ -364,8 +366,8 @@ class WorldEndpoint(TunnelEnd):
         self._scans, self._frames, self._session_ns = 0, 0, now_ns
         if self._scanner is not None:
             self._scan_ns = now_ns
-        if self._film is not None:
-            self._film.begin_session()
+        if self._frame_source is not None:
+            self._frame_source.begin_session()
             self._frame_ns = now_ns
         if self._senses:
             self._look_ns = min(self._sample_ns, now_ns)

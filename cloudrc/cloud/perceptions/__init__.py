@@ -9,7 +9,7 @@ returns a `Perception`; all parameters are annotated.
 from __future__ import annotations
 
 from math import cos, sin
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,10 +34,6 @@ class Frame(NamedTuple):
     number: int  # in the session, from 0 on
     image: NDArray[np.uint8]  # red, green, blue, shape (height, width, 3); row 0 is the highest
     fovy: float  # angle from the lowest to the highest row [rad]
-
-
-Seen: TypeAlias = Scan | Frame
-"""What a perception gets."""
 
 
 def yaw_of(odometry: Odometry) -> float:

@@ -111,9 +111,9 @@ def run_cloud(
             make_worker=lambda extra: Background(extra.end if extra else None),
         )
         end.readers, cloud.watch = readers, readers.see
-        cloud.sight.watch_frame = lambda frame: readers.show_picture(frame.stamp_ns, frame.image)
+        cloud.sensors.watch_frame = lambda frame: readers.show_picture(frame.stamp_ns, frame.image)
         if (scan := experiment.robot.scan) is not None:
-            cloud.sight.watch_scan = lambda *sent: readers.show(scan_record(scan, *sent))
+            cloud.sensors.watch_scan = lambda *sent: readers.show(scan_record(scan, *sent))
 
         def flies() -> bool:
             return cloud.guard is GuardState.TRACK

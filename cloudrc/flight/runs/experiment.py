@@ -15,7 +15,8 @@ from cloudrc.config.overrides import OUTSIDE, Settings, naming_settings, parse_s
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import has_mujoco
-from cloudrc.config.schema import Parameters, World
+from cloudrc.config.schema import Parameters
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.flight.drivers.machine import usable_cores
 from cloudrc.flight.drivers.transports import find_transport
 from cloudrc.flight.runs.requirements import require

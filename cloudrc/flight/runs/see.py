@@ -19,7 +19,7 @@ from cloudrc.base.errors import describe_error
 from cloudrc.base.outside.code import attempt
 from cloudrc.base.outside.values import InvalidValueError
 from cloudrc.cloud.perceiving import judge
-from cloudrc.cloud.perceptions import Frame, Perception, Scan, Seen
+from cloudrc.cloud.perceptions import Frame, Perception, Scan
 from cloudrc.config.choice import PlugIn
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.resolved import ResolvedExperiment
@@ -83,7 +83,7 @@ def _look(
     flown = dict(rows_of(steered, "seen_stamp_ns", "position"))
     measured = [*starmap(Odometry, rows_of(odometry, "stamp_ns", *Odometry._fields[1:]))]
 
-    def see(seen: Seen, at: Odometry) -> Setpoint | None:
+    def see(seen: Scan | Frame, at: Odometry) -> Setpoint | None:
         result = perception.see(seen, at)
         return None if result is None else judge(result, fence.inner_low, fence.inner_high)
 
@@ -100,7 +100,9 @@ def _look(
         yield SecondLook(now, setpoint, place if known else None, why)
 
 
-def _seen(recording: Recording, experiment: ResolvedExperiment, sensor: str) -> Iterator[Seen]:
+def _seen(
+    recording: Recording, experiment: ResolvedExperiment, sensor: str
+) -> Iterator[Scan | Frame]:
     """Yield what cloud had, in the order in which it was shown."""
     robot = experiment.robot
     kept = recording["/scan" if sensor == "scan" else "/camera"]

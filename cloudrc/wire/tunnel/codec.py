@@ -16,15 +16,15 @@ from enum import IntEnum
 from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.wire.messages import (
+    FRAGMENT_MAX,
     NEVER_NS,
-    PIECE_MAX,
     RAYS_MAX,
     SENSORS_MAX,
     TOUCH_NAME_MAX,
     Cause,
     Command,
     Datagram,
-    FramePiece,
+    Fragment,
     GuardState,
     Odometry,
     OperatorRequest,
@@ -132,7 +132,7 @@ _sizes_of: dict[int, Container[int]] = {
     int(Kind.TELEMETRY): frozenset(TELEMETRY_SIZES),
     int(Kind.COMMAND): frozenset(COMMAND_SIZES),
     int(Kind.SCAN): frozenset(SCAN_SIZES),
-    int(Kind.FRAME): range(SIZES[Kind.FRAME] + 1, SIZES[Kind.FRAME] + PIECE_MAX + 1),
+    int(Kind.FRAME): range(SIZES[Kind.FRAME] + 1, SIZES[Kind.FRAME] + FRAGMENT_MAX + 1),
     int(Kind.OPERATOR): range(SIZES[Kind.OPERATOR], SIZES[Kind.OPERATOR] + TOUCH_NAME_MAX + 1),
 }
 """Kind -> valid sizes of its datagrams [bytes]."""
@@ -254,18 +254,18 @@ def decode_scan(body: bytes) -> RangeScan:
     return RangeScan(stamp_ns, tuple(millimetres))
 
 
-def encode_piece(piece: FramePiece) -> bytes:
+def encode_fragment(fragment: Fragment) -> bytes:
     """Encode the body of a FRAME datagram."""
-    *fields, data = piece
+    *fields, data = fragment
     return _FRAME.pack(*fields) + data
 
 
-def decode_piece(body: bytes) -> FramePiece:
+def decode_fragment(body: bytes) -> Fragment:
     """Decode the body of a FRAME datagram."""
-    stamp_ns, number, piece, pieces, key = _FRAME.unpack_from(body)
-    if piece >= pieces or key > 1:
+    stamp_ns, number, place, count, key = _FRAME.unpack_from(body)
+    if place >= count or key > 1:
         raise DecodeError("malformed")
-    return FramePiece(stamp_ns, number, piece, pieces, bool(key), body[_FRAME.size :])
+    return Fragment(stamp_ns, number, place, count, bool(key), body[_FRAME.size :])
 
 
 def encode_operator(request: OperatorRequest) -> bytes:

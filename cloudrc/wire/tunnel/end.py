@@ -9,13 +9,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from cloudrc.wire.messages import Command, Datagram, FramePiece, Passed, RangeScan, Telemetry
+from cloudrc.wire.messages import Command, Datagram, Fragment, Passed, RangeScan, Telemetry
 from cloudrc.wire.records import Fault, FaultCode, Record
 from cloudrc.wire.tunnel import codec
 from cloudrc.wire.tunnel.codec import (
     Direction,
     encode_command,
-    encode_piece,
+    encode_fragment,
     encode_scan,
     encode_telemetry,
 )
@@ -28,7 +28,7 @@ _ENCODERS: dict[type, Callable[[Any], bytes]] = {
     Telemetry: encode_telemetry,
     Command: encode_command,
     RangeScan: encode_scan,
-    FramePiece: encode_piece,
+    Fragment: encode_fragment,
 }
 
 
@@ -103,7 +103,7 @@ class TunnelEnd:
     def _send(self, kind: int, body: bytes) -> None:
         self._queue(self._session.seal(kind, body))
 
-    def _encode(self, kind: int, message: Telemetry | Command | RangeScan | FramePiece) -> bytes:
+    def _encode(self, kind: int, message: Telemetry | Command | RangeScan | Fragment) -> bytes:
         return self._session.seal(kind, _ENCODERS[type(message)](message))
 
     def _queue(self, datagram: Datagram) -> None:

@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 
 from cloudrc.link.verify.probe import PROBE
 from cloudrc.wire.messages import (
-    PIECE_MAX,
+    FRAGMENT_MAX,
     RAYS_MAX,
     SENSORS_MAX,
     Cause,
     Command,
-    FramePiece,
+    Fragment,
     GuardState,
     Odometry,
     OperatorRequest,
@@ -51,11 +51,11 @@ requests = st.builds(
 )
 distances = st.lists(unsigned[16], max_size=RAYS_MAX).map(tuple)
 scans = st.builds(RangeScan, stamps, distances)
-pieces = st.integers(1, 2**16 - 1).flatmap(
+fragments = st.integers(1, 2**16 - 1).flatmap(
     lambda count: st.builds(
-        FramePiece,
+        Fragment,
         *(stamps, unsigned[32], st.integers(0, count - 1), st.just(count), st.booleans()),
-        st.binary(min_size=1, max_size=PIECE_MAX),
+        st.binary(min_size=1, max_size=FRAGMENT_MAX),
     )
 )
 
@@ -65,7 +65,7 @@ COME_BACK = {
     "command": commands,
     "operator": requests,
     "scan": scans,
-    "piece": pieces,
+    "fragment": fragments,
 }
 
 
@@ -104,7 +104,7 @@ def test_every_wrong_length_direction_and_version_is_refused(kind):
         Kind.OPERATOR: {len(whole) + n for n in range(1, 65)},
         Kind.TELEMETRY: {len(whole) + 8 * n for n in range(1, 17)},
         Kind.SCAN: {len(whole) + 2 * n for n in range(1, 542)},
-        Kind.FRAME: {len(whole) + n for n in range(1, PIECE_MAX)},
+        Kind.FRAME: {len(whole) + n for n in range(1, FRAGMENT_MAX)},
     }.get(kind, set())
     assert max(longer, default=0) <= codec.DATAGRAM_MAX <= 1200
     for length in {*range(1300), 2048} - longer - {len(whole)}:
@@ -128,7 +128,7 @@ def test_an_unknown_kind_is_refused_at_every_length():
 
 
 LARGEST = codec.encode_operator(OperatorRequest(1, Request.PROGRESS, Start.HERE, 2**63 - 1))
-PIECE = codec.encode_piece(FramePiece(1, 2, 0, 2, False, b"."))
+FRAGMENT = codec.encode_fragment(Fragment(1, 2, 0, 2, False, b"."))
 TELEMETRY = bytes(codec.BODY_SIZES[Kind.TELEMETRY])
 
 
@@ -138,8 +138,8 @@ TELEMETRY = bytes(codec.BODY_SIZES[Kind.TELEMETRY])
         (codec.decode_operator, LARGEST, 4, max(Request)),
         (codec.decode_operator, LARGEST, 5, max(Start)),
         (codec.decode_operator, LARGEST, 13, 0x7F),  # a mission that no recording can name
-        (codec.decode_piece, PIECE, 12, 1),  # of two
-        (codec.decode_piece, PIECE, 16, True),
+        (codec.decode_fragment, FRAGMENT, 12, 1),  # of two
+        (codec.decode_fragment, FRAGMENT, 16, True),
         (codec.decode_telemetry, TELEMETRY, -2, max(GuardState)),
         (codec.decode_telemetry, TELEMETRY, -1, max(Cause)),
     ],

@@ -4,7 +4,7 @@
 
 import pytest
 
-from cloudrc.wire.messages import ZERO, Command, FramePiece, RangeScan
+from cloudrc.wire.messages import ZERO, Command, Fragment, RangeScan
 from cloudrc.wire.tunnel import codec
 from cloudrc.wire.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.wire.tunnel.keys import Key, KeyRing, KeySet
@@ -170,7 +170,7 @@ def test_a_passed_message_has_the_counter_of_its_datagram():
     [
         (Kind.COMMAND, Command(1, 2, 3, ZERO, 0.0, (ZERO, ZERO)), codec.encode_command),
         (Kind.SCAN, RangeScan(1, (0, 300, 20)), codec.encode_scan),
-        (Kind.FRAME, FramePiece(1, 2, 0, 1, True, b"jpeg"), codec.encode_piece),
+        (Kind.FRAME, Fragment(1, 2, 0, 1, True, b"jpeg"), codec.encode_fragment),
     ],
 )
 def test_a_passed_message_is_as_long_as_its_datagram(kind, message, encode):

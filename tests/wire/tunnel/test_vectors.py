@@ -8,7 +8,7 @@ import struct
 
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from cloudrc.wire.messages import Command, FramePiece, RangeScan
+from cloudrc.wire.messages import Command, Fragment, RangeScan
 from cloudrc.wire.tunnel import codec
 from cloudrc.wire.tunnel.codec import Direction, Kind
 from cloudrc.wire.tunnel.handshake import ClientHandshake, ServerHandshake
@@ -103,13 +103,13 @@ def test_the_tunnel_is_as_described_and_as_it_was():
     assert cloud.open(sent) == (9, 7, 0, scan)
     assert codec.decode_scan(scan) == RangeScan(1, (0, 2, 65535))
     assert len(world.seal(Kind.SCAN, codec.encode_scan(RangeScan(1, (0,) * 181)))) == 402
-    piece = FramePiece(1, 2, 3, 4, True, bytes(1151))
-    body = codec.encode_piece(piece)
+    fragment = Fragment(1, 2, 3, 4, True, bytes(1151))
+    body = codec.encode_fragment(fragment)
     assert body == struct.pack("<qIHHB", 1, 2, 3, 4, 1) + bytes(1151)
     sent = world.seal(Kind.FRAME, body)
     assert sent == sealed(0, 7, 10, 0, body)
     assert len(sent) == 1200
-    assert codec.decode_piece(cloud.open(sent)[3]) == piece
+    assert codec.decode_fragment(cloud.open(sent)[3]) == fragment
 
 
 def test_names_and_nonces_are_derived_as_described():

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pictures are cut into pieces, and a picture that is due too early is late."""
+"""Pictures are cut into fragments, and a picture that is due too early is late."""
 
 from collections import Counter
 
@@ -9,9 +9,9 @@ import pytest
 
 from cloudrc.config.camera import CameraConfig
 from cloudrc.wire.endpoint import Outcome
-from cloudrc.wire.messages import PIECE_MAX
-from cloudrc.wire.pictures import Encoded
-from cloudrc.world.filming import Film, TakenPicture
+from cloudrc.wire.messages import FRAGMENT_MAX
+from cloudrc.wire.pictures import EncodedFrame
+from cloudrc.world.frame_source import FrameSource
 
 IMAGE = np.zeros((2, 2, 3), np.uint8)
 
@@ -28,7 +28,7 @@ class Camera:
 
 class Codec:
     def encode(self, image):
-        return Encoded(b"data", True)
+        return EncodedFrame(b"data", True)
 
     def decode(self, data):
         return IMAGE
@@ -47,25 +47,25 @@ class Slow:
         return Outcome(self.call(), None, 10, 15) if self.done else None
 
 
-def film(worker=None):
+def source(worker=None):
     counts = Counter()
-    return Film(Camera(), lambda: (Codec(), Codec()), worker, counts), counts
+    return FrameSource(Camera(), lambda: (Codec(), Codec()), worker, counts), counts
 
 
-@pytest.mark.parametrize("size", [1, PIECE_MAX, PIECE_MAX + 1, 5000])
-def test_a_picture_is_cut_into_pieces_that_make_it_again(size):
+@pytest.mark.parametrize("size", [1, FRAGMENT_MAX, FRAGMENT_MAX + 1, 5000])
+def test_a_picture_is_cut_into_fragments_that_make_it_again(size):
     data = bytes(k % 251 for k in range(size))
-    pieces = [*TakenPicture(5, 3, Encoded(data, True), 40.0, 0).pieces()]
-    assert b"".join(each.data for each in pieces) == data
-    assert {(each.stamp_ns, each.number, each.pieces, each.key) for each in pieces} == {
-        (5, 3, len(pieces), True)
+    cut = [*EncodedFrame(data, True, 5, 3).fragments()]
+    assert b"".join(each.data for each in cut) == data
+    assert {(each.stamp_ns, each.number, each.fragments, each.key) for each in cut} == {
+        (5, 3, len(cut), True)
     }
-    assert [each.piece for each in pieces] == [*range(len(pieces))]
-    assert max(len(each.data) for each in pieces) <= PIECE_MAX
+    assert [each.fragment for each in cut] == [*range(len(cut))]
+    assert max(len(each.data) for each in cut) <= FRAGMENT_MAX
 
 
 def test_without_a_worker_a_picture_takes_no_time():
-    made, counts = film()
+    made, counts = source()
     for now_ns in (10, 20):
         made.take(now_ns)
         picture = made.finished()
@@ -78,13 +78,13 @@ def test_without_a_worker_a_picture_takes_no_time():
 
 def test_a_picture_that_is_due_while_one_is_rendered_is_late():
     worker = Slow()
-    made, counts = film(worker)
+    made, counts = source(worker)
     made.take(10)
     assert made.finished() is None
     made.take(20)
     assert counts["frames_late"] == 1
     worker.done = True
-    assert made.finished()[:2] == (10, 0)
+    assert made.finished()[2:4] == (10, 0)
     made.take(30)
     worker.done = True
     picture = made.finished()
@@ -93,19 +93,19 @@ def test_a_picture_that_is_due_while_one_is_rendered_is_late():
 
 def test_a_picture_of_an_earlier_session_is_not_sent():
     worker = Slow()
-    made, _ = film(worker)
+    made, _ = source(worker)
     made.take(10)
     made.begin_session()
     worker.done = True
     assert made.finished() is None
     made.take(20)
     worker.done = True
-    assert made.finished()[:2] == (20, 0)
+    assert made.finished()[2:4] == (20, 0)
 
 
 def test_a_failure_of_the_renderer_ends_the_flight():
     worker = Slow()
-    made, _ = film(worker)
+    made, _ = source(worker)
     made.take(10)
     worker.take = lambda: Outcome(None, RuntimeError("GL"), 0, 0)
     with pytest.raises(RuntimeError, match="GL"):

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Put the pieces of pictures together, and decode what can be decoded.
+"""Put the fragments of pictures together, and decode what can be decoded.
 
-A picture is shown when its last piece is there, and all that it needs: a key frame needs nothing,
-another one the picture before it. Nothing is sent again. So after a loss, H.264 waits for the next
-key frame, while of JPEG each picture is a key frame.
+A picture is shown when its last fragment is there, and all that it needs: a key frame needs
+nothing, another one the picture before it. Nothing is sent again. So after a loss, H.264 waits for
+the next key frame, while of JPEG each picture is a key frame.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from cloudrc.cloud.perceptions import Frame
-from cloudrc.wire.messages import FramePiece
+from cloudrc.wire.messages import Fragment
 from cloudrc.wire.pictures import Decoder, Image
 from cloudrc.wire.records import FrameKept, FrameShown
 
@@ -20,18 +20,19 @@ WINDOW = 64
 """Number of pictures by which one may be older than the newest before it is given up."""
 
 
-class _Partial:
-    """A picture of which some pieces are there."""
+class _Fragments:
+    """The fragments of a picture that are there."""
 
-    def __init__(self, first: FramePiece) -> None:
+    def __init__(self, first: Fragment) -> None:
         self.stamp_ns, self.key = first.stamp_ns, first.key
-        self.parts: list[bytes | None] = [None] * first.pieces
-        self.missing = first.pieces
-        self.arrived_ns = 0  # when its last piece arrived [ns]
+        self.parts: list[bytes | None] = [None] * first.fragments
+        self.missing = first.fragments
+        self.arrived_ns = 0  # when its last fragment arrived [ns]
 
-    def add(self, piece: FramePiece, now_ns: int) -> None:
-        if piece.piece < len(self.parts) and self.parts[piece.piece] is None:
-            self.parts[piece.piece] = piece.data
+    def add(self, given: Fragment, now_ns: int) -> None:
+        place = given.fragment
+        if place < len(self.parts) and self.parts[place] is None:
+            self.parts[place] = given.data
             self.missing -= 1
             self.arrived_ns = now_ns
 
@@ -68,21 +69,21 @@ class FrameReceiver:
     def begin_session(self, epoch: int) -> None:
         """Expect picture 0, or another key frame, of the session `epoch`."""
         self._epoch, self._decoder = epoch, self._make_decoder()
-        self._partial = dict[int, _Partial]()
+        self._begun = dict[int, _Fragments]()
         self._next = 0  # number of the oldest picture that may still be shown
         self._newest = -1
         self._follows = False  # whether the decoder has the picture before `_next`
 
-    def receive(self, piece: FramePiece, now_ns: int) -> list[Frame]:
-        """Take a piece that arrived at `now_ns` [ns], cloud's clock; return what is shown now."""
-        number = piece.number
+    def receive(self, fragment: Fragment, now_ns: int) -> list[Frame]:
+        """Take what arrived at `now_ns` [ns], cloud's clock; return what is shown now."""
+        number = fragment.number
         if number < max(self._next, self._newest - WINDOW):
             return []
         if number > self._newest:
             self._newest = number
             self._forget(number - WINDOW)
-        found = self._partial.setdefault(number, _Partial(piece))
-        found.add(piece, now_ns)
+        found = self._begun.setdefault(number, _Fragments(fragment))
+        found.add(fragment, now_ns)
         if found.missing:
             return []
         if found.key:
@@ -99,15 +100,15 @@ class FrameReceiver:
 
     def _forget(self, before: int) -> None:
         """Give up the pictures with a number below `before`."""
-        for number in [each for each in self._partial if each < before]:
-            del self._partial[number]
+        for number in [each for each in self._begun if each < before]:
+            del self._begun[number]
 
     def _show(self, now_ns: int) -> list[Frame]:
         """Decode the pictures that follow the last one without a gap."""
         shown = list[Frame]()
-        while self._follows and (found := self._partial.get(self._next)) and not found.missing:
+        while self._follows and (found := self._begun.get(self._next)) and not found.missing:
             number, data = self._next, found.data
-            del self._partial[number]
+            del self._begun[number]
             self._next += 1
             image = self._decoder.decode(data)
             self._follows = image is not None

@@ -8,9 +8,9 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from cloudrc.cloud.frame_receiver import FrameReceiver
 from cloudrc.cloud.perceiving import Perceiver
 from cloudrc.cloud.perceptions import Frame
-from cloudrc.cloud.receiving import FrameReceiver
 from cloudrc.wire.messages import RangeScan
 from cloudrc.wire.records import Record
 from cloudrc.wire.tunnel import codec
@@ -21,7 +21,7 @@ KINDS = frozenset((int(Kind.SCAN), int(Kind.FRAME)))
 """Kinds of datagrams with what the robot sees."""
 
 
-class Sight:
+class SensorReceiver:
     """What the robot sees, as cloud gets it.
 
     Attributes:
@@ -59,10 +59,10 @@ class Sight:
         if kind == Kind.SCAN:
             self._receive_scan(epoch, counter, body, now_ns)
             return ()
-        piece = codec.decode_piece(body) if type(body) is bytes else body
+        fragment = codec.decode_fragment(body) if type(body) is bytes else body
         if self._frames is None:
             return ()
-        for frame in self._frames.receive(piece, now_ns):
+        for frame in self._frames.receive(fragment, now_ns):
             if self.watch_frame is not None:
                 self.watch_frame(frame)
             if self._perceiver is not None:

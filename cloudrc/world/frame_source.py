@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Take the pictures of the robot's camera, encode them, and cut them into pieces.
+"""Take the pictures of the robot's camera, and encode them.
 
 In real time, a thread renders and encodes. A picture that is due meanwhile is not taken, and
 counted as late: so a slow machine sends fewer pictures, not older ones.
@@ -9,14 +9,13 @@ counted as late: so a slow machine sends fewer pictures, not older ones.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from cloudrc.config.camera import CameraConfig
 from cloudrc.wire.endpoint import Outcome, Worker
-from cloudrc.wire.messages import PIECE_MAX, FramePiece
-from cloudrc.wire.pictures import Decoder, Encoded, Encoder, Image, psnr
+from cloudrc.wire.pictures import Decoder, EncodedFrame, Encoder, Image, psnr
 
 
 class Renderer(Protocol):
@@ -31,26 +30,8 @@ class Renderer(Protocol):
         """Return what the camera saw at the last `aim`."""
 
 
-class TakenPicture(NamedTuple):
-    """A picture that is ready to be sent."""
-
-    stamp_ns: int  # time at which it was taken [ns], world's clock
-    number: int  # in its session
-    encoded: Encoded
-    psnr: float  # of what a receiver decodes [dB]
-    encode_ns: int  # time that rendering and encoding took [ns]
-
-    def pieces(self) -> Iterator[FramePiece]:
-        """Cut the picture."""
-        data, key = self.encoded
-        cuts = range(0, len(data), PIECE_MAX)
-        for piece, at in enumerate(cuts):
-            part = data[at : at + PIECE_MAX]
-            yield FramePiece(self.stamp_ns, self.number, piece, len(cuts), key, part)
-
-
-class Film:
-    """The pictures of a session.
+class FrameSource:
+    """Takes the pictures of a session.
 
     Attributes:
         rate_hz: Number of pictures per second [Hz].
@@ -76,7 +57,7 @@ class Film:
         self._codec, self._taken = make_codec(), 0
         self._busy: tuple[int, int] | None = None  # session and stamp of what the worker has
         self._session = 0
-        self._ready: TakenPicture | None = None
+        self._ready: EncodedFrame | None = None
 
     def begin_session(self) -> None:
         """Begin with picture 0, a key frame."""
@@ -92,13 +73,12 @@ class Film:
         call = partial(self._make, *self._codec)
         number, self._taken = self._taken, self._taken + 1
         if self._worker is None:
-            encoded, quality = call()
-            self._ready = TakenPicture(now_ns, number, encoded, quality, 0)
+            self._ready = call()._replace(stamp_ns=now_ns, number=number)
         else:
             self._busy = self._session, now_ns
             self._worker.begin(call, now_ns)
 
-    def finished(self) -> TakenPicture | None:
+    def finished(self) -> EncodedFrame | None:
         """Return the picture that is ready, once."""
         if self._busy is not None and self._worker is not None:
             if (outcome := self._worker.take()) is not None:
@@ -112,14 +92,16 @@ class Film:
         if outcome.error is not None:
             raise outcome.error
         if session == self._session:
-            encoded, quality = outcome.result
+            made: EncodedFrame = outcome.result
             lasts_ns = outcome.done_ns - outcome.begun_ns
-            self._ready = TakenPicture(stamp_ns, self._taken - 1, encoded, quality, lasts_ns)
+            self._ready = made._replace(
+                stamp_ns=stamp_ns, number=self._taken - 1, encode_ns=lasts_ns
+            )
 
-    def _make(self, encoder: Encoder, decoder: Decoder) -> tuple[Encoded, float]:
+    def _make(self, encoder: Encoder, decoder: Decoder) -> EncodedFrame:
         """Render and encode, in whichever thread."""
         image = self._camera.render()
         encoded = encoder.encode(image)
         decoded = decoder.decode(encoded.data)
         assert decoded is not None, "what was encoded can be decoded"
-        return encoded, psnr(image, decoded)
+        return encoded._replace(psnr=psnr(image, decoded))

@@ -7,10 +7,10 @@ from math import sqrt
 import numpy as np
 import pytest
 
-from cloudrc.cloud.receiving import WINDOW, FrameReceiver
+from cloudrc.cloud.frame_receiver import WINDOW, FrameReceiver
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.wire.messages import FramePiece
+from cloudrc.wire.messages import Fragment
 from cloudrc.wire.tunnel.codec import Kind
 
 IMAGE = np.zeros((2, 2, 3), np.uint8)
@@ -33,13 +33,13 @@ def receiver(keep=None):
     return made, decoders
 
 
-def pieces(number, count=1, *, key=False, data=b"."):
-    return [FramePiece(number * 100, number, piece, count, key, data) for piece in range(count)]
+def fragments(number, count=1, *, key=False, data=b"."):
+    return [Fragment(number * 100, number, n, count, key, data) for n in range(count)]
 
 
 def numbers(made, *sent):
-    """Return the numbers of the pictures that each piece shows."""
-    return [[frame.number for frame in made.receive(piece, 7)] for piece in sent]
+    """Return the numbers of the pictures that each fragment shows."""
+    return [[frame.number for frame in made.receive(fragment, 7)] for fragment in sent]
 
 
 KEY = {"key": True}
@@ -60,14 +60,14 @@ KEY = {"key": True}
 )
 def test_a_picture_is_shown_when_all_that_it_needs_is_there(sent, shown):
     made, _ = receiver()
-    found = [pieces(number, count, **keys)[0] for number, count, keys in sent]
+    found = [fragments(number, count, **keys)[0] for number, count, keys in sent]
     assert numbers(made, *found) == shown
 
 
 def test_the_last_piece_shows_a_picture_and_repeats_change_nothing():
     made, decoders = receiver()
     first, second, third = (
-        each._replace(data=bytes([n])) for n, each in enumerate(pieces(0, 3, key=True))
+        each._replace(data=bytes([n])) for n, each in enumerate(fragments(0, 3, key=True))
     )
     (frame,) = [f for p in (third, first, third, first, second, second) for f in made.receive(p, 9)]
     assert (frame.stamp_ns, frame.number, frame.fovy) == (0, 0, 0.5)
@@ -77,17 +77,17 @@ def test_the_last_piece_shows_a_picture_and_repeats_change_nothing():
 def test_a_gap_takes_a_new_decoder_and_a_whole_stream_keeps_its_own():
     made, decoders = receiver()
     for number in (0, 1, 2, 3):
-        made.receive(*pieces(number, key=number in (0, 2)), 7)
+        made.receive(*fragments(number, key=number in (0, 2)), 7)
     assert len(decoders[-1].given) == 4
-    made.receive(*pieces(9, key=True), 7)
+    made.receive(*fragments(9, key=True), 7)
     assert len(decoders[-1].given) == 1
 
 
 def test_records_tell_when_the_last_piece_came_and_what_is_kept():
     made, _ = receiver(keep=lambda data, image: ("jpeg", data))
     made.begin_session(5)
-    made.receive(*pieces(1), 20)
-    made.receive(*pieces(0, key=True, data=b"x"), 30)
+    made.receive(*fragments(1), 20)
+    made.receive(*fragments(0, key=True, data=b"x"), 30)
     told = made.take_records()
     assert [tuple(each) for each in told] == [
         *((30, 5, 0, 0, 0), (30, "jpeg", b"x")),
@@ -99,8 +99,8 @@ def test_records_tell_when_the_last_piece_came_and_what_is_kept():
 def test_a_stream_without_its_key_frame_takes_little_memory():
     made, _ = receiver()
     for number in range(1, 1000):
-        assert made.receive(*pieces(number), 7) == []
-    assert len(made._partial) <= WINDOW + 1
+        assert made.receive(*fragments(number), 7) == []
+    assert len(made._begun) <= WINDOW + 1
 
 
 def stream(groups, loss, count, key_count, group):
@@ -109,10 +109,10 @@ def stream(groups, loss, count, key_count, group):
     made, counter, shown = receiver()[0], 0, np.zeros(groups * group, bool)
     for number in range(groups * group):
         is_key = number % group == 0
-        for piece in pieces(number, key_count if is_key else count, key=is_key):
+        for fragment in fragments(number, key_count if is_key else count, key=is_key):
             arrives = link.send(1, Kind.FRAME, counter, 1200, number)
             counter += 1
-            for frame in made.receive(piece, number) if arrives else ():
+            for frame in made.receive(fragment, number) if arrives else ():
                 shown[frame.number] = True
     return shown.reshape(groups, group)
 
