@@ -45,11 +45,11 @@ def test_every_topic_of_an_old_recording_is_read():
 
 
 def test_flights_of_an_old_sweep_are_compared_and_drawn(old, call, as_json):
-    command = "compare last_sample constant_velocity --in sweep --number obstacle_contacts"
+    command = "compare last_sample constant_velocity --in sweep --metric obstacle_contacts"
     document = as_json(command)
     assert [*document["numbers"]] == ["obstacle_contacts"]
     assert document["pairs"] == 2
-    call("sweep figure sweep --x cloud.predictor --number obstacle_contacts")
+    call("sweep figure sweep --x cloud.predictor --metric obstacle_contacts")
     assert (old / "sweep" / "figure.svg").stat().st_size
 
 

@@ -92,7 +92,7 @@ def main() -> None:
             cells(fly("predictors", Path(folder, "predictors"))),
         )
         fly("delay", delay := Path(folder, "delay"))
-        cloudrc("sweep", "figure", delay, "--number", ERROR, "--by", "predictor")
+        cloudrc("sweep", "figure", delay, "--metric", ERROR, "--by", "predictor")
         shutil.copy(delay / "figure.png", ROOT / "docs" / "delay.png")
         draw_policy(Path(folder))
         cloudrc("reproduce", "-o", paper := Path(folder, "paper"))

@@ -270,7 +270,7 @@ class CloudEndpoint(TunnelEnd):
         hello = self._handshake.answer_challenge(cookie)
         asks = self._wants_session(now_ns) or self._session.is_outdated
         if hello is not None and asks:
-            self._queue(self._session.greet(Kind.HELLO, hello, self._session.greeting_key))
+            self._queue(self._session.sign(Kind.HELLO, hello, self._session.handshake_key))
 
     def _receive_busy(self, nonce: bytes, now_ns: int) -> None:
         """Tell the user that another cloud has the session, if cloud's hello was refused."""
@@ -303,7 +303,7 @@ class CloudEndpoint(TunnelEnd):
         self._hellos += 1
         if self._session.epoch == NO_EPOCH:  # the key of the last session was dropped
             self._handshake.leave()
-        self._queue(self._session.greet(Kind.HELLO, self._handshake.make_hello(), key))
+        self._queue(self._session.sign(Kind.HELLO, self._handshake.make_hello(), key))
 
     def _wants_session(self, now_ns: int) -> bool:
         return self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS
@@ -314,7 +314,7 @@ class CloudEndpoint(TunnelEnd):
         if nonces is None:
             self.counts["accept_ignored"] += 1
             return
-        self._session.begin(epoch, nonces, self._session.greeting_key)
+        self._session.begin(epoch, nonces, self._session.handshake_key)
         self._told.clear()
         self._window.reset()
         self.sensors.begin_session(epoch)

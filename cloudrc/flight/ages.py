@@ -131,11 +131,11 @@ def _cross(
         key = stream_key(experiment.seed, uplink, 1, kind, experiment.stream)
         blocks = range(numbers[-1] // BLOCK + 1 if numbers else 0)
         tables = [impairments(key, block, profile, only.jitter, only.loss) for block in blocks]
-        fates = [tables[number // BLOCK][number % BLOCK] for number in numbers]
+        packets = [tables[number // BLOCK][number % BLOCK] for number in numbers]
     else:
         datagrams = zip(numbers, sent_ns.tolist(), strict=True)
-        fates = [link.send(1, kind, number, size, now_ns) for number, now_ns in datagrams]
-    copies = [(row, entry) for row, fate in enumerate(fates) for entry in fate]
+        packets = [link.send(1, kind, number, size, now_ns) for number, now_ns in datagrams]
+    copies = [(row, entry) for row, packet in enumerate(packets) for entry in packet]
     rows, at_ns = np.array(copies, np.int64).reshape(-1, 2).T
     if only is not None:
         delays_ns = np.where(at_ns == OVERTAKES, 0, only.delay_ns + at_ns)

@@ -11,8 +11,8 @@ t = round(k dt), and W is how long the robot waits in a tick for an answer:
    A message is a packet, or several that leave together; a stream repairs what is lost.
 3. Policy, up to t + W: it begins when an observation has arrived and its last answer is computed.
    It takes the newest observation that has arrived by then, and drops older ones. The answer leaves
-   after the compute time, as the packet whose number is the tick of the observation: so the fate of
-   a packet depends neither on the compute time nor on the executor.
+   after the compute time, as the packet whose number is the tick of the observation: so delay
+   and loss of a packet depend neither on the compute time nor on the executor.
    If it answers in every tick, it begins at t at the earliest, with the newest observation that has
    arrived by t + W, and the packet's number is that of the tick.
 4. The robot receives the answers that have arrived by t + W, and executes an action.

@@ -34,9 +34,9 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     The world never waits: one step of the environment takes `dt`, and observations and actions that
     are late are late. The policy answers when an observation arrives, once to each. Rewards and the
     end of an episode are those of the world, told at once. Nothing else leaks: the observation, and
-    the environment's info with it, are the newest that the policy has taken. The fate of a packet
-    depends on seed, stream, direction, episode and tick alone, so that another policy meets the
-    same network.
+    the environment's info with it, are the newest that the policy has taken. Delay and loss of a
+    packet depend on seed, stream, direction, episode and tick alone, so that another policy meets
+    the same network.
 
     `info["cloudrc"]` tells whether the observation is new, so that the next action is its answer
     (`asked`; any other action is ignored), the ages of the observation and of the executed action

@@ -42,7 +42,8 @@ _PARETO_DEVIATION = sqrt(_PARETO_SQUARE - _PARETO_MEAN**2)
 
 Floats = NDArray[np.float64]
 StreamKey = tuple[int, int]
-Fate = tuple[int, ...]
+Copies = tuple[int, ...]
+"""A time [ns] for each copy of a packet that arrives; none if the packet is lost."""
 
 
 class Purpose(IntEnum):
@@ -154,7 +155,7 @@ def bad_states(key: StreamKey, block: int, bad_start: float, bad_end: float) -> 
 
 def impairments(
     key: StreamKey, block: int, profile: DirectionProfile, jitter: float, loss: Loss
-) -> list[Fate]:
+) -> list[Copies]:
     """Draw the impairments of the 256 packets of a block.
 
     `jitter` [s] and `loss` are arguments, because a profile can change them over time. A lost
@@ -164,7 +165,7 @@ def impairments(
     Deviation: tc-netem delivers one copy of a packet that is both duplicated and lost.
     """
     offsets = _offsets(key, Purpose.DELAY, block, profile, jitter)
-    table: list[Fate] = [(offset,) for offset in offsets]
+    table: list[Copies] = [(offset,) for offset in offsets]
     for n in _packets_hit(key, Purpose.REORDER, block, profile.reorder):
         table[n] = (OVERTAKES,)
     if profile.duplicate:
@@ -240,7 +241,7 @@ def _packets_hit(key: StreamKey, purpose: Purpose, block: int, chance: float) ->
     return hit
 
 
-def _lose_in_bursts(table: list[Fate], key: StreamKey, block: int, loss: GilbertElliott) -> None:
+def _lose_in_bursts(table: list[Copies], key: StreamKey, block: int, loss: GilbertElliott) -> None:
     """Lose packets of a block in bursts; add `delay_bad_ms` to those that pass in the bad state."""
     extra = round(loss.delay_bad_ms * 1e-3 * 1e9)
     draws = uniforms(key, Purpose.LOSS, block).tolist()

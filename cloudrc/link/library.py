@@ -20,7 +20,7 @@ from cloudrc.base.outside.refusal import naming
 from cloudrc.base.outside.values import Quantity
 from cloudrc.link.draws import (
     BLOCK,
-    Fate,
+    Copies,
     Floats,
     Purpose,
     StreamKey,
@@ -196,7 +196,7 @@ class OneWay:
         self._usual: int | None = None  # size of the first message of the episode [bytes]
         self._link = self._new(0)
 
-    def send(self, episode: int, number: int, size: int, now_ns: int) -> Fate:
+    def send(self, episode: int, number: int, size: int, now_ns: int) -> Copies:
         """Send one packet, whatever its size; compute when it arrives.
 
         `send_message` cuts what does not fit into a packet of a network.
@@ -237,10 +237,10 @@ class OneWay:
         *,
         usual: int | None = None,
         packet_bytes: int = PACKET_BYTES,
-    ) -> Fate:
+    ) -> Copies:
         """Send a message as packets that leave at one instant; compute when it is whole.
 
-        Each packet has a fate of its own; a message of one packet has that of `send`. Do not use
+        Each packet is delayed and lost by itself; a message of one packet as by `send`. Do not use
         both in one episode.
 
         Args:

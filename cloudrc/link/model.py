@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, TypeAlias
 
-from cloudrc.link.draws import BLOCK, OVERTAKES, Fate, bit_flips, impairments, stream_key
+from cloudrc.link.draws import BLOCK, OVERTAKES, Copies, bit_flips, impairments, stream_key
 from cloudrc.link.profile import Conditions, DirectionProfile, LinkSchedule, Loss
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class LinkDirection:
             self._radio = slots_of(profile.radio, self._uplink)
         has_rate = times_ns or any(p.rate is not None for p in self._schedule.pieces)
         self._plain = not profile.keep_order and not has_rate and not profile.radio
-        self._fates: dict[tuple[int, int, int, float, Loss], list[Fate]] = {}
+        self._tables: dict[tuple[int, int, int, float, Loss], list[Copies]] = {}
         self._place: tuple[int, int, int, Conditions] | None = None
 
     def restart(self, origin_ns: int) -> None:
@@ -127,7 +127,7 @@ class LinkDirection:
         if self._opportunities is not None:
             self._opportunities.restart()
 
-    def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
+    def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Copies:
         """Send one packet of `size` bytes of UDP payload at `now_ns` [ns]; compute when it arrives.
 
         Epoch, kind and counter identify the packet. As in tc-netem, random losses occur before the
@@ -146,23 +146,23 @@ class LinkDirection:
         place = (epoch, kind, counter // BLOCK, conditions)
         if place != self._place:  # comparing takes less time than a look into the dictionary
             self._place, self._table = place, self._find_table(*place)
-        fate = self._table[counter % BLOCK]
-        if len(fate) == 1 and self._plain:  # nearly all packets: save time
-            delay_ns = conditions.delay_ns + fate[0]
+        copies = self._table[counter % BLOCK]
+        if len(copies) == 1 and self._plain:  # nearly all packets: save time
+            delay_ns = conditions.delay_ns + copies[0]
             return (now_ns + delay_ns if delay_ns > 0 else now_ns,)
         packet = epoch, kind, counter
-        if len(fate) == 1:
-            arrival = self._arrival(fate[0], conditions, size, now_ns, packet, 0)
+        if len(copies) == 1:
+            arrival = self._arrival(copies[0], conditions, size, now_ns, packet, 0)
             return () if arrival is None else (arrival,)
         arrivals = [
             self._arrival(entry, conditions, size, now_ns, packet, copy)
-            for copy, entry in enumerate(fate)
+            for copy, entry in enumerate(copies)
         ]
         return tuple([arrival for arrival in arrivals if arrival is not None])
 
     def send_pieces(
         self, epoch: int, pieces: Iterable[tuple[int, int, int]], now_ns: int
-    ) -> tuple[Fate, int]:
+    ) -> tuple[Copies, int]:
         """Send the packets of a message at `now_ns` [ns]: kind, counter and size [bytes] of each.
 
         A damaged packet is lost. Of two copies the first counts.
@@ -179,7 +179,7 @@ class LinkDirection:
                 lost += 1
         return () if lost else (whole_ns,), lost
 
-    def send_checked(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
+    def send_checked(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Copies:
         """Send a packet as `send` does; a damaged one is lost, as behind a checksum."""
         arrivals = self.send(epoch, kind, counter, size, now_ns)
         if arrivals and self.corrupts and self.corrupted(epoch, kind, counter, _BYTE) != _BYTE:
@@ -292,13 +292,15 @@ class LinkDirection:
         departures.append(self._opportunities.leave_ns(size, now_ns - origin_ns) + origin_ns)
         return departures[-1]
 
-    def _find_table(self, epoch: int, kind: int, block: int, conditions: Conditions) -> list[Fate]:
+    def _find_table(
+        self, epoch: int, kind: int, block: int, conditions: Conditions
+    ) -> list[Copies]:
         jitter, loss = conditions.jitter, conditions.loss
         key = (epoch, kind, block, jitter, loss)
-        if key in self._fates:
-            return self._fates[key]
+        if key in self._tables:
+            return self._tables[key]
         stream = stream_key(self._seed, self._uplink, epoch, kind, self._stream)
-        if len(self._fates) >= _TABLES:
-            del self._fates[next(iter(self._fates))]
-        table = self._fates[key] = impairments(stream, block, self._profile, jitter, loss)
+        if len(self._tables) >= _TABLES:
+            del self._tables[next(iter(self._tables))]
+        table = self._tables[key] = impairments(stream, block, self._profile, jitter, loss)
         return table

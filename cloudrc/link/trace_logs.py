@@ -149,15 +149,15 @@ def _read_trips(trips: list[dict[str, Any]], direction: Direction | None) -> lis
     sent_ns = [int(stamp.get("monotonic", stamp.get("wall"))) for stamp in stamps]
     entries = list[Entry]()
     for trip, stamp_ns in zip(trips, sent_ns, strict=True):
-        sent, fate, delay = (stamp_ns - sent_ns[0]) * 1e-9, str(trip["lost"]).lower(), nan
-        if fate == "false" and direction:
+        sent, lost, delay = (stamp_ns - sent_ns[0]) * 1e-9, str(trip["lost"]).lower(), nan
+        if lost == "false" and direction:
             up, down = int(trip["delay"]["send"]), int(trip["delay"]["receive"])
             refuse_early(min(up, down) * 1e-9)  # of the other direction, too
             delay = (up if direction == "uplink" else down) * 1e-9
-        elif fate == "false":
+        elif lost == "false":
             delay = int(trip["delay"]["rtt"]) * 0.5e-9
-        if (direction, fate) != ("downlink", "true_up"):
-            arrived = fate == "false" or (direction, fate) == ("uplink", "true_down")
+        if (direction, lost) != ("downlink", "true_up"):
+            arrived = lost == "false" or (direction, lost) == ("uplink", "true_down")
             entries.append((sent, delay, arrived))
     return entries
 

@@ -150,8 +150,8 @@ def _valid(pairs: Sequence[Pair]) -> list[Pair]:
 
 def _check_numbers(names: Iterable[str], known: Iterable[str]) -> None:
     if RATIO in names and RATIO not in known and OFF_PATH in known:
-        raise problem_at("--number", NO_RATIO)
-    check_names("number", names, sorted(known), "--number: ")
+        raise problem_at("--metric", NO_RATIO)
+    check_names("metric", names, sorted(known), "--metric: ")
 
 
 def _lacking(pairs: Sequence[Pair], name: str) -> dict[str, int]:

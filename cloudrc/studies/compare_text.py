@@ -107,7 +107,7 @@ def _answer(document: Mapping[str, Any]) -> str:
             f" {less.upper()} in {success[less]}, p = {success['p_mcnemar']:.2g}.\n"
         )
     if not document["numbers"]:
-        return f"{text}No pair has one of these numbers; name another with --number."
+        return f"{text}No pair has one of these metrics; name another with --metric."
     name, entry = next(iter(document["numbers"].items()))
     p, count = f"p = {entry['p_wilcoxon']:.2g}", entry["count"]
     if not entry["decided"]:

@@ -79,7 +79,7 @@ def draw_sweep(
 def _shown(rows: Sequence[Row], names: Sequence[str]) -> Sequence[str]:
     """Return the metrics to show, of which some flight has each."""
     known = sorted({name for row in rows if counts(row) for name in row["numbers"]})
-    check_names("number", names, known, "--number: ")
+    check_names("metric", names, known, "--metric: ")
     return names or default_numbers(known)[:SHOWN]
 
 

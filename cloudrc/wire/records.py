@@ -194,9 +194,7 @@ class FrameShown(NamedTuple):
     epoch: Epoch
     number: Annotated[int, "", "of the picture in its session"]
     taken_ns: Annotated[int, "ns", "time at which it was taken, world's clock"]
-    wait_ns: Annotated[
-        int, "ns", "from the arrival of its last fragment until the stamp of the row"
-    ]
+    wait_ns: Annotated[int, "ns", "from its last fragment's arrival until the stamp of the row"]
 
 
 class FrameKept(NamedTuple):

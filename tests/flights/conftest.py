@@ -93,7 +93,7 @@ class BareCloud:
         self.heard = []
 
     def hello(self):
-        return self.session.greet(Kind.HELLO, self.handshake.make_hello())
+        return self.session.sign(Kind.HELLO, self.handshake.make_hello())
 
     def command(self, now_ns=0, basis_ns=None, velocity=ZERO):
         basis_ns = now_ns if basis_ns is None else basis_ns
@@ -120,7 +120,7 @@ class BareCloud:
         self.heard.append(Kind(kind).name)
         if kind == Kind.CHALLENGE:
             hello = self.handshake.answer_challenge(codec.decode(Kind.CHALLENGE, body)[0])
-            return hello and self.session.greet(Kind.HELLO, hello)
+            return hello and self.session.sign(Kind.HELLO, hello)
         if kind == Kind.ACCEPT:
             accept = codec.Accept(*codec.decode(Kind.ACCEPT, body))
             nonces = self.handshake.receive_accept(epoch, accept, asks=True)
@@ -154,7 +154,7 @@ class Bare:
         return self.clouds[name]
 
     def hello(self, name):
-        """Greet as this cloud; return the epoch that it got, 0 if none."""
+        """Do the handshake as this cloud; return the epoch that it got, 0 if none."""
         self.speaker = self.cloud(name)
         self.send(self.speaker.hello())
         return self.speaker.session.epoch

@@ -2,8 +2,8 @@
 
 """The link between environment and policy equals a simulation that is written from its rule alone.
 
-The rule is in docs/gym.md. The simulation shares no code with cloudrc.gym: it takes the fates of
-packets from the link library, and has the executors as functions of all answers received so far.
+The rule is in docs/gym.md. The simulation shares no code with cloudrc.gym: it takes delays
+and losses from the link library, and has the executors as functions of all answers received so far.
 """
 
 from functools import cache

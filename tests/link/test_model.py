@@ -111,11 +111,11 @@ def pareto(z):
 )
 def test_many_draws_match_their_distribution(shape, cumulative, deviation, count):
     delay, jitter, loss, root = 0.060, 0.005, 0.02, sqrt(count)
-    fates = flow(profile_of(delay, jitter, shape, loss=loss), count)
-    lost = np.array([not copies for copies in fates])
+    packets = flow(profile_of(delay, jitter, shape, loss=loss), count)
+    lost = np.array([not copies for copies in packets])
     assert lost.mean() == pytest.approx(loss, abs=4 * sqrt(loss * (1 - loss)) / root)
     assert np.mean(loss_runs(stream_of(lost))) == pytest.approx(1 / (1 - loss), rel=10 / root)
-    drawn = np.sort((np.array([one[0] for one in fates if one]) * 1e-9 - delay) / jitter)
+    drawn = np.sort((np.array([one[0] for one in packets if one]) * 1e-9 - delay) / jitter)
     assert drawn.mean() == pytest.approx(0.0, abs=4.04 / root)
     assert drawn.std() == pytest.approx(deviation, rel=10 / root)
     some = drawn[:: count // 2000]
@@ -141,18 +141,18 @@ def test_a_table_is_drawn_from_about_its_mean():
 
 def test_the_bad_state_loses_or_delays_packets():
     loss = in_bursts(0.1, 0.1, loss_bad=0.5, loss_good=0.0, delay_bad=0.040)
-    fate = flow(profile_of(0.030, loss=loss), COUNT)
-    assert set(fate) == {(), (30 * MS,), (70 * MS,)}
-    assert fate.count(()) / COUNT == pytest.approx(0.25, abs=0.02)
-    assert fate.count((70 * MS,)) / COUNT == pytest.approx(0.25, abs=0.02)
+    arrivals = flow(profile_of(0.030, loss=loss), COUNT)
+    assert set(arrivals) == {(), (30 * MS,), (70 * MS,)}
+    assert arrivals.count(()) / COUNT == pytest.approx(0.25, abs=0.02)
+    assert arrivals.count((70 * MS,)) / COUNT == pytest.approx(0.25, abs=0.02)
     for certain in (1.0, in_bursts(1.0, 0.0)):
         assert set(flow(profile_of(duplicate=1.0, loss=certain), 1000)) == {()}
 
 
 def test_a_reordered_packet_skips_delay_and_queue():
-    fate = flow(profile_of(0.045, 0.005, reorder=0.1), COUNT)
-    assert fate.count((0,)) / COUNT == pytest.approx(0.1, abs=0.01)
-    assert min(copies[0] for copies in fate if copies != (0,)) >= 40 * MS
+    arrivals = flow(profile_of(0.045, 0.005, reorder=0.1), COUNT)
+    assert arrivals.count((0,)) / COUNT == pytest.approx(0.1, abs=0.01)
+    assert min(copies[0] for copies in arrivals if copies != (0,)) >= 40 * MS
     bad = in_bursts(1.0, 0.0, loss_bad=0.0, delay_bad=0.040)
     slow = profile_of(0.030, rate=1e3, queue_packets=1, reorder=1.0, loss=bad)
     assert set(flow(slow, 100)) == {(0,)}
@@ -179,12 +179,12 @@ def test_nothing_arrives_before_the_shortest_delay(profile, seed):
     direction = link(profile, seed)
     shortest_ns = direction.shortest_ns
     assert shortest_ns >= 0
-    fates = [direction.send(1, 3, n, SIZE, n * 5 * MS) for n in range(400)]
-    for n, releases in enumerate(fates):
+    packets = [direction.send(1, 3, n, SIZE, n * 5 * MS) for n in range(400)]
+    for n, releases in enumerate(packets):
         assert len(releases) <= 2
         assert all(type(r) is int and r >= n * 5 * MS + shortest_ns for r in releases)
     if profile.keep_order:
-        arrivals = [r for releases in fates for r in releases]
+        arrivals = [r for releases in packets for r in releases]
         assert arrivals == sorted(arrivals)
 
 

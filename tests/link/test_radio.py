@@ -120,8 +120,8 @@ def test_repetitions_are_geometric_and_leave_other_draws_alone():
     for n in range(2000):
         now_ns = n * 7 * MS
         parts = [sum(way.radio_parts(0, 128, n, now_ns, copy)) for copy in (0, 1)]
-        fate = way.send(0, 128, n, 100, now_ns)
-        assert [at - part for at, part in zip(fate, parts, strict=False)] == [
+        arrivals = way.send(0, 128, n, 100, now_ns)
+        assert [at - part for at, part in zip(arrivals, parts, strict=False)] == [
             *bare.send(0, 128, n, 100, now_ns)
         ]
         differ += parts[0] != parts[1]

@@ -26,9 +26,9 @@ examples:
   cloudrc compare cloud.predictor=constant_velocity \\
     cloud.predictor=constant_acceleration --set link.profile=paper-p3
   cloudrc compare cloud.predictor=last_sample \\
-    cloud.predictor=constant_velocity,cloud.estimator=split --number iae_mean
+    cloud.predictor=constant_velocity,cloud.estimator=split --metric iae_mean
   cloudrc compare cloud.estimator=running_mean cloud.estimator=split \\
-    --set link.profile=handover --number delay_estimate_error_rms
+    --set link.profile=handover --metric delay_estimate_error_rms
   cloudrc compare runs/before runs/after --budget
   cloudrc compare constant_velocity constant_acceleration --in runs/sweep-grid-1"""
 
@@ -42,7 +42,7 @@ def arguments(parser: Parser) -> None:
         "--in", dest="sweep", type=Path, metavar="DIR", help="compare flights of this sweep"
     )
     about = "compare this metric instead of the default ones; repeatable"
-    parser.add_argument("--number", action="append", default=[], metavar="NAME", help=about)
+    parser.add_argument("--metric", action="append", default=[], metavar="NAME", help=about)
     about = "fly each seed once more without a network; compare J/J0, the cost of control relative"
     where = "where the setpoint waits for the robot off_ideal_path and T/T0"
     parser.add_argument(
@@ -93,7 +93,7 @@ def execute(options: Options) -> int:
         if not found.pairs:
             return stopped.exit_code
     with Progress(f"compares {len(found.pairs):,} pairs of flights"):
-        names = budget_numbers(found.pairs) if options.budget else options.number
+        names = budget_numbers(found.pairs) if options.budget else options.metric
         compared = compare(found.pairs, found.units, names)
     document = {
         **{"a": options.a, "b": options.b, "of": found.what},
@@ -143,7 +143,7 @@ def _fly_both(options: Options) -> tuple[Pairs, CloudrcError | None]:
         if "=" not in text:
             raise BadInputError(f"{text}: is not KEY=VALUE; for a value of a sweep, add --in DIR")
     sides = split_settings(options.a), split_settings(options.b)
-    asked = options.experiment, options.set, *sides, options.seeds, options.number
+    asked = options.experiment, options.set, *sides, options.seeds, options.metric
     plan = plan_sides(*asked, cost=options.cost)
     warn_about(plan)
     count = len(plan.flights)

@@ -31,7 +31,7 @@ before it reports that something is off.
 With --mode cluster the command judges the link of a release in flight by the
 tunnel's own datagrams, within a minute. It reports what it cannot judge.
 
-exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
+exit codes: 0 verified, 1 not verified or undecided, 2 bad input,
 3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
 
 

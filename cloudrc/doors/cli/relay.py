@@ -26,8 +26,8 @@ A client connects to --listen instead of the server. The uplink leads to the
 server. The relay hands bytes on with the link's delay and rate: one round trip
 to open, one more for a lost segment, one bottleneck for all connections. A
 change by 'cloudrc link set' acts on open connections, too. Ctrl-C ends the
-relay, and prints the turns: the times from the last byte of a request to the
-first byte of its answer.
+relay, and prints the request-response times: from the last byte of a request
+to the first byte of its answer.
 
 It needs no privileges, and is not a congestion control. 'cloudrc link exec'
 passes every IP packet through the link instead, with the TCP of the kernel:
@@ -112,10 +112,10 @@ def execute(options: Options) -> None:
 
 
 def _as_text(report: dict[str, Any]) -> str:
-    turns = report["turns"]
-    times = ", ".join(f"{name} {turns[name] * 1e3:.1f} ms" for name in turns if name != "count")
+    found = report["turns"]  # request-response times
+    times = ", ".join(f"{name} {found[name] * 1e3:.1f} ms" for name in found if name != "count")
     return (
         f"{report['connections']} connections, {report['refused']} refused;"
         f" {report['uplink_bytes']} bytes up, {report['downlink_bytes']} down\n"
-        f"{turns['count']} turns{times and ': '}{times}"
+        f"{found['count']} request-response times{times and ': '}{times}"
     )

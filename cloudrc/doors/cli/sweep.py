@@ -69,7 +69,7 @@ def arguments(parser: Parser) -> None:
     for each in (run, attach, status):
         output_argument(each)
     about = "metric to draw; repeatable (default: three that matter first)"
-    figure.add_argument("--number", action="append", default=[], metavar="NAME", help=about)
+    figure.add_argument("--metric", action="append", default=[], metavar="NAME", help=about)
     about = "axis of the sweep along x (default: the first one with numbers)"
     figure.add_argument("--x", metavar="AXIS", help=about)
     about = "axis with one line per value (default: the first with names, else the next one)"

@@ -173,7 +173,7 @@ def figure(options: Options) -> None:
         if not any(row["point"] for row in found.rows):
             text = "this sweep has no axis; give its file a grid, or see its metrics in table.csv"
             raise BadInputError(f"{options.folder}: {text}")
-        shown = options.number, options.x, options.by
+        shown = options.metric, options.x, options.by
         files, caption = draw_sweep(found.rows, found.units, *shown, look)
     out = options.out or options.folder / "figure"
     stem = out.stem if out.suffix.removeprefix(".") in files else out.name

@@ -45,8 +45,8 @@ NUMBER_MAX = 2**32 - 1  # highest number of an operator request
 class Kind(IntEnum):
     """Kind of a datagram's content. Each kind has its own counter in each direction.
 
-    Kinds up to LAST_GREETING belong to the handshake and are authenticated with the pre-shared key.
-    The other kinds belong to a session and are encrypted with the session's keys.
+    Kinds up to LAST_HANDSHAKE belong to the handshake and are authenticated with the pre-shared
+    key. The other kinds belong to a session and are encrypted with the session's keys.
     """
 
     HELLO = 1
@@ -110,7 +110,7 @@ _BODIES = {
 _TELEMETRY, _COMMAND = _BODIES[Kind.TELEMETRY], _BODIES[Kind.COMMAND]
 _OPERATOR, _SCAN, _FRAME = _BODIES[Kind.OPERATOR], _BODIES[Kind.SCAN], _BODIES[Kind.FRAME]
 BODY_SIZES = {kind: body.size for kind, body in _BODIES.items()}
-LAST_GREETING = int(Kind.BUSY)
+LAST_HANDSHAKE = int(Kind.BUSY)
 HEADER_SIZE, TAG_SIZE = _HEADER.size, 16
 SIZES = {int(kind): HEADER_SIZE + size + TAG_SIZE for kind, size in BODY_SIZES.items()}
 

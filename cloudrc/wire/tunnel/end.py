@@ -97,7 +97,7 @@ class TunnelEnd:
         """
         if outcome == "version":
             self._tell("version", VERSION_TEXT.format(data[0], codec.VERSION), now_ns)
-        elif outcome == "tag" and codec.peek(data)[0] <= codec.LAST_GREETING:
+        elif outcome == "tag" and codec.peek(data)[0] <= codec.LAST_HANDSHAKE:
             self._tell("key", KEY_TEXT, now_ns)
 
     def _send(self, kind: int, body: bytes) -> None:

@@ -94,13 +94,13 @@ class ServerHandshake:
 
     def receive_hello(self, hello: Hello, counter: int, now_ns: int) -> HelloAnswer:
         """Answer a HELLO at `now_ns` [ns], after `Session.open` has verified the datagram."""
-        session, key = self._session, self._session.greeting_key
+        session, key = self._session, self._session.handshake_key
         if not self._has_cookie(hello, now_ns):
             if now_ns - self._challenged_ns < CHALLENGE_NS:
                 return HelloAnswer("unanswered", [])
             self._challenged_ns = now_ns
             challenge = codec.encode(Kind.CHALLENGE, self._cookie(now_ns))
-            return HelloAnswer("hello", [session.greet(Kind.CHALLENGE, challenge, key)])
+            return HelloAnswer("hello", [session.sign(Kind.CHALLENGE, challenge, key)])
         if counter <= self._counters.get(hello.nonce, -1):
             return HelloAnswer(REPEATED, [])
         self._counters.pop(hello.nonce, None)  # the nonce answered last comes last
@@ -112,7 +112,8 @@ class ServerHandshake:
                 return HelloAnswer("hello", [self._accept()])
         elif now_ns <= self._fresh_until_ns:
             return HelloAnswer(
-                "busy", [session.greet(Kind.BUSY, codec.encode(Kind.BUSY, hello.nonce), key)]
+                "busy",
+                [session.sign(Kind.BUSY, codec.encode(Kind.BUSY, hello.nonce), key)],
             )
         self._incumbent = hello
         if is_newer(hello.epoch, self._epoch):
@@ -135,7 +136,7 @@ class ServerHandshake:
         for cloud, and after a HELLO with a newer key. More than REPEATS_MAX HELLOs with another key
         end it, too, if nothing else arrives in between: cloud has lost the epoch's key.
         """
-        session, key = self._session, self._session.greeting_key
+        session, key = self._session, self._session.handshake_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
         is_left = session.epoch == NO_EPOCH or is_newer(hello.epoch, self._epoch)
         if is_upgrade or is_left:
@@ -152,7 +153,7 @@ class ServerHandshake:
 
     def _accept(self) -> bytes:
         accept = Accept(self._incumbent.nonce, self._nonce, self._clock)
-        return self._session.greet(Kind.ACCEPT, codec.encode(Kind.ACCEPT, *accept))
+        return self._session.sign(Kind.ACCEPT, codec.encode(Kind.ACCEPT, *accept))
 
     def _cookie(self, now_ns: int, slots_ago: int = 0) -> bytes:
         slot = now_ns // COOKIE_NS - slots_ago

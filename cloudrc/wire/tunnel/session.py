@@ -18,7 +18,7 @@ from cloudrc.wire.messages import Datagram, Passed
 from cloudrc.wire.tunnel.codec import (
     COMMAND_SIZES,
     HEADER_SIZE,
-    LAST_GREETING,
+    LAST_HANDSHAKE,
     SCAN_SIZES,
     SIZES,
     TAG_SIZE,
@@ -33,7 +33,7 @@ from cloudrc.wire.tunnel.keys import Key, KeyRing
 
 COMMAND, SCAN, FRAME = int(Kind.COMMAND), int(Kind.SCAN), int(Kind.FRAME)  # often looked up
 NO_EPOCH = 0  # epoch of an end without a session, and of every HELLO, CHALLENGE and BUSY datagram
-TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}  # kinds without a session
+TIMELESS = frozenset(range(1, LAST_HANDSHAKE + 1)) - {Kind.ACCEPT}  # kinds without a session
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
@@ -41,14 +41,14 @@ class Session:
     """Keys and counters of world or cloud in the present session.
 
     `epoch` is the number of the session, or `NO_EPOCH`. `epoch_key` is the pre-shared key of the
-    session; `is_outdated` tells whether the key file has a newer key. `greeting_key` is the
+    session; `is_outdated` tells whether the key file has a newer key. `handshake_key` is the
     pre-shared key that verified the last handshake datagram.
     """
 
     def __init__(self, sends: Direction, ring: KeyRing) -> None:
         """Set the direction in which this endpoint sends, and `ring`, the pre-shared keys."""
         self.epoch, self.ring, self._keys = NO_EPOCH, ring, ring.keys
-        self.greeting_key = self.epoch_key = self._keys.current
+        self.handshake_key = self.epoch_key = self._keys.current
         self.is_outdated = False
         self._sends, self._opens = int(sends), 1 - int(sends)
         self._counters = dict.fromkeys(map(int, Kind), 0)
@@ -94,7 +94,7 @@ class Session:
             size = TELEMETRY_SIZES[len(message.sensors)]
         return _new(Passed, (kind, self.epoch, counter, message, size))
 
-    def greet(self, kind: int, body: bytes, key: Key | None = None) -> bytes:
+    def sign(self, kind: int, body: bytes, key: Key | None = None) -> bytes:
         """Make a handshake datagram with a tag made with `key`, by default the session's key."""
         counter = self._counters[kind]
         self._counters[kind] = counter + 1
@@ -119,8 +119,8 @@ class Session:
         if direction != self._opens:
             raise DecodeError("direction")
         self.follow_keys()
-        if kind <= LAST_GREETING:
-            return kind, epoch, counter, self._open_greeting(data)
+        if kind <= LAST_HANDSHAKE:
+            return kind, epoch, counter, self._open_handshake(data)
         if epoch != self.epoch or not epoch:
             raise DecodeError("old_epoch")
         try:
@@ -144,11 +144,11 @@ class Session:
         if self.epoch_key not in keys.accepted:
             self.epoch = NO_EPOCH
 
-    def _open_greeting(self, data: bytes) -> bytes:
+    def _open_handshake(self, data: bytes) -> bytes:
         signed, tag = data[:-TAG_SIZE], data[-TAG_SIZE:]
         for key in self._keys.accepted:
             if key.verifies(signed, tag):
-                self.greeting_key = key
+                self.handshake_key = key
                 return signed[HEADER_SIZE:]
         raise DecodeError("tag")
 

@@ -95,9 +95,9 @@ def test_messages_cross_as_the_profile_and_the_seed_say(tmp_path):
         one.publish(400)
         report, _ = end()
     up, _ = cloudrc.link.open(PROFILE, 5, stream="b")
-    fates = [up.send(1, number, 24, 0) for number in range(400)]
+    packets = [up.send(1, number, 24, 0) for number in range(400)]
     assert {n: len(ages) for n, ages in one.ages.items()} == {
-        float(n): len(fate) for n, fate in enumerate(fates) if fate
+        float(n): len(arrivals) for n, arrivals in enumerate(packets) if arrivals
     }
     assert (report["verdict"], report["type"]) == ("believed", "geometry_msgs/msg/Point")
     assert report["counts"]["received"] == 400

@@ -76,13 +76,13 @@ def causes(said):
     return [(cause["code"], cause["way"]) for cause in said["causes"]]
 
 
-def test_a_release_is_believed_once_both_ends_do(release):
+def test_a_release_is_verified_once_both_ends_do(release):
     release.hears(world="ok", cloud="ok")
     said = release.ask()
     assert (said["verdict"], said["shaper"]) == ("believed", "shaped by relay")
     (mean,) = (row for row in said["directions"]["uplink"]["rows"] if row["name"] == "mean")
     assert mean["measured"] == pytest.approx(0.0451)
-    assert as_text(said).splitlines()[-1].startswith("BELIEVED")
+    assert as_text(said).splitlines()[-1].startswith("VERIFIED")
 
 
 def test_a_fault_names_its_direction(release):

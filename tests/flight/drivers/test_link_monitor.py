@@ -12,7 +12,7 @@ from cloudrc.wire.records import Lateness, LinkChecked, Record
 from tests.conftest import wait_until
 from tests.doors.console.conftest import control
 from tests.link.profiles import changed, profile_of
-from tests.link.verify.conftest import arrivals, asked, checked, hearing, is_believed
+from tests.link.verify.conftest import arrivals, asked, checked, hearing, is_verified
 
 PAPER = asked("paper-p2", "downlink")
 
@@ -20,14 +20,14 @@ PAPER = asked("paper-p2", "downlink")
 @pytest.mark.parametrize(
     ("name", "netem"), [*((name, False) for name in names("profile")), ("lte", True)]
 )
-def test_an_honest_link_is_believed_and_never_faulted(name, netem):
+def test_an_honest_link_is_verified_and_never_faulted(name, netem):
     profile = asked(name, "uplink")
     seconds = 60.0 if netem or name == "handover" else 15.0
     made, seed = (netem_makes(profile), 3) if netem else (profile, 1)
     heard = arrivals(made, seconds, seed=seed, uplink=True)
     moments, faults = checked(hearing(profile, PAPER, uplink=True), heard)
     assert faults == []
-    assert is_believed(moments[-1]), moments[-1]
+    assert is_verified(moments[-1]), moments[-1]
     assert ("correlation" in moments[-1]) == (netem and profile.correlation > 0.0)
     assert ("rate" in moments[-1]) == (profile.rate_kbit is not None)
     assert ("time_line" in moments[-1]) == (name == "handover")

@@ -66,9 +66,9 @@ def log_of(profile, late_ns=0, count=2000, size=100):
     log, model = PacketLog(), LinkDirection(profile, 7, True)
     for number in range(count):
         sent_ns = number * 10 * MS
-        fate = model.send(1, KIND, number, size - 28, sent_ns)
-        log.enter(sent_ns, size, fate)
-        for due_ns in fate:
+        arrivals = model.send(1, KIND, number, size - 28, sent_ns)
+        log.enter(sent_ns, size, arrivals)
+        for due_ns in arrivals:
             log.leave(number, due_ns + late_ns)
     return log
 
@@ -79,7 +79,7 @@ def judged(log, profile, cuts=False):
     return {row.name: value for value, row in rows}, {row.name: row.verdict for _, row in rows}
 
 
-def test_a_relay_is_believed_unless_it_is_late_or_loses_packets_by_itself():
+def test_a_relay_is_verified_unless_it_is_late_or_loses_packets_by_itself():
     profile = profile_of(0.040, 0.010, loss=0.02)
     log = log_of(profile, 20_000)
     asked, verdicts = judged(log, profile)

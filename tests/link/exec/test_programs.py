@@ -110,7 +110,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.mark.smoke
 @pytest.mark.skipif(not shutil.which("curl"), reason="needs curl")
-def test_curl_downloads_over_a_lossy_link_and_the_link_is_believed(folder):
+def test_curl_downloads_over_a_lossy_link_and_the_link_is_verified(folder):
     client = "for n in 1 2 3 4; do curl -s http://{server}:8000/blob | sha256sum; done"
     flags = "--link", "paper-p3", "--set", "downlink.loss=0.01", "-o", "out"
     out, _ = run(*flags, client=client)
@@ -170,8 +170,12 @@ def distances(profile, family):
     for way, at in (("uplink", 0), ("downlink", 1)):
         measured = (times[:, at + 1] - times[:, at]) * 1e-9
         model = LinkDirection(link_profile(getattr(both, way)), 99, way == "uplink")
-        fates = [model.send(1, 7, number, 40, number * 4_000_000) for number in range(4000)]
-        drawn = [(fate[0] - number * 4_000_000) * 1e-9 for number, fate in enumerate(fates) if fate]
+        packets = [model.send(1, 7, number, 40, number * 4_000_000) for number in range(4000)]
+        drawn = [
+            (arrivals[0] - number * 4_000_000) * 1e-9
+            for number, arrivals in enumerate(packets)
+            if arrivals
+        ]
         below = np.searchsorted(np.sort(drawn), np.sort(measured)) / len(drawn)
         found[way] = float(np.abs(below - np.linspace(0, 1, len(below))).max())
     return found

@@ -63,10 +63,10 @@ def arrivals(profile, seconds=60.0, *, seed=SEED, overhead=5e-4, uplink=False):
     kind, whole = KINDS[uplink], bytes(SIZES[KINDS[uplink]])
     for n in range(round(seconds * 100)):
         sent_ns = n * PERIOD_NS
-        fate = link.send(1, kind, n, len(whole), sent_ns)
+        arrivals = link.send(1, kind, n, len(whole), sent_ns)
         if link.corrupts and link.corrupted(1, kind, n, whole) != whole:
             continue
-        for at_ns in fate:
+        for at_ns in arrivals:
             delay = (at_ns - sent_ns) * 1e-9 + overhead
             found.append(Arrival(at_ns, uplink, 1, n, delay, True))
     return sorted(found)
@@ -91,7 +91,7 @@ def checked(monitor, records):
     return moments, faults
 
 
-def is_believed(moment):
+def is_verified(moment):
     return {row.verdict for row in moment.values()} - {"told"} == {"ok"}
 
 

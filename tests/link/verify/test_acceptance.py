@@ -29,7 +29,7 @@ def doubts(rows):
 
 @pytest.mark.promise("verify-tells-the-link")
 @pytest.mark.parametrize("count", [60, *nightly(200)])
-def test_every_honest_link_is_believed(count):
+def test_every_honest_link_is_verified(count):
     rng = np.random.default_rng(1)
     links = [asked(name, way) for name in names("profile") for way in ("uplink", "downlink")]
     links += [random_profile(rng) for _ in range(count - len(links))]
@@ -78,7 +78,7 @@ def test_a_link_beyond_its_tolerance_is_off(name):
     assert (quantity, "off") in doubts(rows_of(profile, changed(profile, **values)))
 
 
-def test_netem_is_believed_unless_it_delays_twice_as_long():
+def test_netem_is_verified_unless_it_delays_twice_as_long():
     profile = profile_of(0.08, 0.02, correlation=0.9)
     assert doubts(rows_of(profile, profile, netem=True)) == []
     assert ("mean", "off") in doubts(rows_of(profile, changed(profile, delay=0.16), netem=True))

@@ -58,7 +58,7 @@ def patience(monkeypatch):
 
 
 @pytest.mark.smoke
-def test_an_honest_link_is_believed_but_not_without_its_qdisc():
+def test_an_honest_link_is_verified_but_not_without_its_qdisc():
     with running() as ways:
         for _ in range(3):  # emulation is slow
             if (said := verify(ways, planned()))["verdict"] == "believed":

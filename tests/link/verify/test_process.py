@@ -22,7 +22,7 @@ LINK += ["link.downlink.jitter_ms=30"]
 
 @pytest.mark.process
 @pytest.mark.alone
-def test_an_honest_link_is_believed_unless_the_machine_delays_it():
+def test_an_honest_link_is_verified_unless_the_machine_delays_it():
     experiment = find_experiment("paper-p1", LINK)
     with run_link(experiment, "relay") as ways:
         found = probe_link(ways, make_plans(experiment, 2.0, "relay"))

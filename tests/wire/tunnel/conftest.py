@@ -41,7 +41,7 @@ class Doorstep:
         counter = self.counter if counter is None else counter
         cookie = self.door._cookie(self.now_ns) if cookie is None else cookie
         self.world.follow_keys()
-        self.world.greeting_key = key or self.world.ring.keys.current
+        self.world.handshake_key = key or self.world.ring.keys.current
         return self.door.receive_hello(Hello(nonce, CLOCK, cookie, epoch), counter, self.now_ns)
 
     def answer(self, *given, **named):

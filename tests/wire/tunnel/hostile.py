@@ -50,7 +50,7 @@ class Target:
                 self.give(datagrams, target)
         assert self.cloud._session.epoch == self.world._session.epoch == 1
         self.captured = tuple(self.frames)
-        self.frames.append(self.world._session.greet(Kind.BUSY, codec.encode(Kind.BUSY, b"c" * 16)))
+        self.frames.append(self.world._session.sign(Kind.BUSY, codec.encode(Kind.BUSY, b"c" * 16)))
         ends = dict.fromkeys(DOWNLINK, self.cloud) | {Kind.TELEMETRY: self.world}
         for kind, end in ends.items():
             self.frames.append(end._session.seal(kind, bytes(codec.BODY_SIZES[kind])))

@@ -36,23 +36,23 @@ def state(session):
 def test_an_end_opens_what_the_other_one_sends():
     world, cloud = pair()
     cloud.seal(Kind.COMMAND, BODY)
-    data, hello = cloud.seal(Kind.COMMAND, BODY), cloud.greet(Kind.HELLO, HELLO)
+    data, hello = cloud.seal(Kind.COMMAND, BODY), cloud.sign(Kind.HELLO, HELLO)
     assert world.open(data) == (Kind.COMMAND, 1, 1, BODY)
     assert refuses(cloud, data, "direction")
     assert world.open(hello) == (Kind.HELLO, NO_EPOCH, 0, HELLO)
-    assert refuses(world, cloud.greet(Kind.HELLO, HELLO, NEW))
+    assert refuses(world, cloud.sign(Kind.HELLO, HELLO, NEW))
     assert refuses(world, data[:16] + BODY + bytes(codec.TAG_SIZE)), "it is not sealed"
     world.begin(2)
     assert refuses(world, data, "old_epoch")
 
 
-def test_without_a_session_only_greetings_are_opened():
+def test_without_a_session_only_the_handshake_is_opened():
     cloud = Session(Direction.DOWNLINK, KeyRing(KeySet(OLD)))
     world, _ = pair(NO_EPOCH)
     telemetry = world.seal(Kind.TELEMETRY, bytes(codec.BODY_SIZES[Kind.TELEMETRY]))
     assert refuses(cloud, telemetry, "old_epoch")
     challenge = codec.encode(Kind.CHALLENGE, b"c" * 13)
-    assert cloud.open(world.greet(Kind.CHALLENGE, challenge))[-1] == challenge
+    assert cloud.open(world.sign(Kind.CHALLENGE, challenge))[-1] == challenge
     with pytest.raises(AssertionError, match=r"^the handshake comes first$"):
         cloud.begin(1)
 
@@ -82,12 +82,12 @@ def test_each_kind_has_its_own_counter_in_each_epoch():
     assert cloud.next_counter(Kind.COMMAND) == 0
 
 
-def test_during_a_rotation_greetings_may_have_either_key():
+def test_during_a_rotation_the_handshake_may_have_either_key():
     world, cloud = pair()
     world.ring.keys = KeySet(NEW, OLD)
     for key in (OLD, NEW):
-        world.open(cloud.greet(Kind.HELLO, HELLO, key))
-        assert world.greeting_key == key
+        world.open(cloud.sign(Kind.HELLO, HELLO, key))
+        assert world.handshake_key == key
     assert world.open(cloud.seal(Kind.COMMAND, BODY))[1] == 1, "the session goes on"
     assert (world.epoch_key, world.is_outdated) == (OLD, True)
     world.begin(2, key=NEW)
@@ -97,7 +97,7 @@ def test_during_a_rotation_greetings_may_have_either_key():
 @pytest.mark.promise("old-keys-end")
 def test_a_dropped_key_opens_nothing():
     world, cloud = pair()
-    sealed, hello = cloud.seal(Kind.COMMAND, BODY), cloud.greet(Kind.HELLO, HELLO)
+    sealed, hello = cloud.seal(Kind.COMMAND, BODY), cloud.sign(Kind.HELLO, HELLO)
     world.ring.keys = KeySet(NEW, Key(b"m" * 32))
     with pytest.raises(DecodeError, match="old_epoch"):
         world.open(sealed)
@@ -118,7 +118,7 @@ def datagrams(count):
             (cloud, world, (Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE, Kind.HELLO)),
         ):
             kind = kinds[number % len(kinds)]
-            make = end.greet if kind <= codec.LAST_GREETING else end.seal
+            make = end.sign if kind <= codec.LAST_HANDSHAKE else end.seal
             made.append((make(kind, bytes([number % 256]) * codec.BODY_SIZES[kind]), other))
     return made
 

@@ -39,8 +39,8 @@ GOLDEN = {
 """Bytes of datagrams. If they change, the format has changed: raise `codec.VERSION`."""
 
 
-def greeting(direction, epoch, kind, counter, body):
-    """Make a greeting as docs/wire.md describes it."""
+def handshake(direction, epoch, kind, counter, body):
+    """Make a message of the handshake as docs/wire.md describes it."""
     data = struct.pack("<BBIBBQ", 8, direction, epoch, 0, kind, counter) + body
     return data + hmac.digest(derived(b"", b"cloudrc 8 greeting"), data, hashlib.sha256)[:16]
 
@@ -65,20 +65,20 @@ def test_the_tunnel_is_as_described_and_as_it_was():
         return told.datagrams[0]
 
     cookie = hmac.digest(derived(WORLD, b"cloudrc 8 cookies"), b"3", hashlib.sha256)[:13]
-    first = cloud.greet(Kind.HELLO, client.make_hello())
+    first = cloud.sign(Kind.HELLO, client.make_hello())
     challenge = answer(first)
     assert codec.decode(Kind.CHALLENGE, cloud.open(challenge)[-1])[0] == cookie
-    second = cloud.greet(Kind.HELLO, client.answer_challenge(cookie) or b"")
+    second = cloud.sign(Kind.HELLO, client.answer_challenge(cookie) or b"")
     accept = answer(second)
     stranger = codec.Hello(b"m" * 16, CLOCK, cookie, 0)
-    busy = answer(cloud.greet(Kind.HELLO, codec.encode(Kind.HELLO, *stranger)))
+    busy = answer(cloud.sign(Kind.HELLO, codec.encode(Kind.HELLO, *stranger)))
     hello, told = CLOUD + CLOCK, struct.pack("<I", 0)
     assert [first, challenge, second, accept, busy] == [
-        greeting(1, 0, 1, 0, hello + bytes(13) + told),
-        greeting(0, 0, 3, 0, cookie + bytes(36)),
-        greeting(1, 0, 1, 1, hello + cookie + told),
-        greeting(0, 7, 2, 0, CLOUD + WORLD + CLOCK + b"\0"),
-        greeting(0, 0, 4, 0, b"m" * 16 + b"\0"),
+        handshake(1, 0, 1, 0, hello + bytes(13) + told),
+        handshake(0, 0, 3, 0, cookie + bytes(36)),
+        handshake(1, 0, 1, 1, hello + cookie + told),
+        handshake(0, 7, 2, 0, CLOUD + WORLD + CLOCK + b"\0"),
+        handshake(0, 0, 4, 0, b"m" * 16 + b"\0"),
     ]
 
     _, epoch, _, body = cloud.open(accept)

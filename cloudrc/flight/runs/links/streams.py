@@ -82,8 +82,8 @@ def _find(to: Address) -> tuple[int, tuple[str, int]]:
 
 
 def _summary(relay: StreamRelay) -> dict[str, Any]:
-    turns: dict[str, float] = {"count": len(relay.turns)}
-    if relay.turns:
-        cuts = np.percentile(np.array(relay.turns) * 1e-9, (50, 95, 100)).tolist()
-        turns |= zip(("median", "p95", "max"), cuts, strict=True)
-    return {"schemaVersion": 1, **relay.counts, "turns": turns}
+    times: dict[str, float] = {"count": len(relay.response_times)}
+    if relay.response_times:
+        cuts = np.percentile(np.array(relay.response_times) * 1e-9, (50, 95, 100)).tolist()
+        times |= zip(("median", "p95", "max"), cuts, strict=True)
+    return {"schemaVersion": 1, **relay.counts, "turns": times}

@@ -46,11 +46,11 @@ COLUMNS = ("asked", "applied", "measured")
 VERDICTS = {"off": "not believed", "open": "undecided", "ok": "believed"}
 """Worst verdict on any quantity of the link -> verdict on the whole link."""
 MEANINGS = {
-    "not believed": ("red", "does not match its profile"),
-    "undecided": ("yellow", "needs more packets"),
-    "believed": ("green", "matches its profile"),
+    "not believed": ("red", "NOT VERIFIED", "does not match its profile"),
+    "undecided": ("yellow", "UNDECIDED", "needs more packets"),
+    "believed": ("green", "VERIFIED", "matches its profile"),
 }
-"""Verdict on a link -> its colour, and what it means."""
+"""Verdict on a link, as files have it -> its colour, its word, and what it means."""
 Report: TypeAlias = dict[str, Any]
 
 
@@ -199,14 +199,14 @@ def as_text(report: Report, paint: Paint = plain, more: str = "--seconds") -> st
         lines += ["", escape(f"{way}: {found['probes']}"), table(rows, [1, 2, 3])]
     causes = [f"  {one['way']}: {one['text']}  [{one['code']}]" for one in report["causes"]]
     lines += ["", *map(escape, [*report["notes"], *causes])]
-    colour, text = MEANINGS[report["verdict"]]
+    colour, word, text = MEANINGS[report["verdict"]]
     if report["verdict"] == "believed" and any(NOT_JUDGED in note for note in report["notes"]):
         text += f", except what is {NOT_JUDGED} (above)"
     if report["verdict"] == "undecided":
         judged = [(way, row) for way, one in report["directions"].items() for row in one["rows"]]
         names = [f"{row['name']} of the {way}" for way, row in judged if row["verdict"] == "open"]
         text += f" ({more})" + f" for {', '.join(names)}" * bool(names)
-    return "\n".join([*lines, paint(f"{report['verdict'].upper()}: the link {text}", colour)])
+    return "\n".join([*lines, paint(f"{word}: the link {text}", colour)])
 
 
 def _cells(row: Mapping[str, Any], shown: Sequence[str]) -> list[str]:

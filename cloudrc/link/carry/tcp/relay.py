@@ -21,7 +21,7 @@ from cloudrc.link.carry.tcp.stream import LinkStream, run_due
 
 CHUNK = 64 << 10  # most bytes that one call reads [bytes]
 BUFFER = 128 << 10  # of the kernel, for each socket and direction [bytes]
-TURNS_KEPT = 100_000  # newest turns of which the times are kept
+TIMES_KEPT = 100_000  # newest request-response times that are kept
 _RESET = b"\x01\0\0\0\0\0\0\0"  # struct linger: on, 0 s: close sends RST
 
 Ways = tuple[Medium, Medium]
@@ -124,7 +124,7 @@ class RelayedConnection:
         if self.dead:
             return
         if side is self.client and data and self.asked_ns:
-            self.relay.turns.append(now_ns - self.asked_ns)
+            self.relay.response_times.append(now_ns - self.asked_ns)
             self.asked_ns = 0
         side.unsent += data
         side.ends |= not data
@@ -173,7 +173,7 @@ class StreamRelay:
 
     Attributes:
         counts: Number of connections, of those that the server refused, and of bytes each way.
-        turns: Times from the last byte of a request to the first byte of its answer [ns].
+        response_times: Times from the last byte of a request to the first byte of its answer [ns].
         engine: Makes the calls of the streams when they are due.
     """
 
@@ -189,7 +189,7 @@ class StreamRelay:
         self.engine, self.connections = Engine(self, ()), set[RelayedConnection]()
         names = "connections", "refused", "uplink_bytes", "downlink_bytes"
         self.counts = dict.fromkeys(names, 0)
-        self.turns = deque[int](maxlen=TURNS_KEPT)
+        self.response_times = deque[int](maxlen=TIMES_KEPT)
         self._ready: list[tuple[selectors.SelectorKey, int]] = []
         self._listening, self._selector = listening, selectors.DefaultSelector()
         listening.setblocking(False)
