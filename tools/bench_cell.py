@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""`make bench-cell`: how punctual is the process `cloudrc cell` with many robots?
+"""`make bench-cell`: how punctual is the process `cloudrc process cell` with many robots?
 
 Each robot's world and cloud send 100 datagrams a second through one process. Beside it,
 `tools/wake_lateness.c` measures how late this machine wakes a sleeping process in the same time.
@@ -92,7 +92,7 @@ def measure(
     sink.bind(("0.0.0.0", 0))
     to, (up, down) = f"127.1.{{robot}}.1:{sink.getsockname()[1]}", free_ports(2, robots)
     ways = f"--uplink 127.0.0.1:{up} --downlink 127.0.0.1:{down} --worlds {to} --clouds {to}"
-    words = f"cell --config {config} {ways} --record {folder / 'cell.csv'} --feed".split()
+    words = f"process cell --config {config} {ways} --record {folder / 'cell.csv'} --feed".split()
     with log.open("wb") as errors:
         cell = subprocess.Popen(
             interpreter("-m", "cloudrc", *words), stdout=subprocess.PIPE, stderr=errors

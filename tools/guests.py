@@ -85,7 +85,7 @@ def _robot(name: str) -> str:
             "## Limits\n",
             table("limit | value", _limits(robot)),
             f"Its files: [robot.yaml]({folder}/robot.yaml), [robot.xml]({folder}/robot.xml).\n"
-            f"`cloudrc robot check {name}` moves it and measures more.\n"
+            f"`cloudrc check {name}` moves it and measures more.\n"
             "A robot of your own: [robot.md](../robot.md).\n",
         ]
     )

@@ -24,7 +24,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import SplitResult, unquote, urlsplit
 
-from cloudrc.doors.cli.parser import COMMANDS, build_parser
+from cloudrc.doors.cli.parser import COMMANDS, Parser, build_parser
 from tools.api import PAGE, public_names
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -143,16 +143,14 @@ def title(source: str) -> str:
 
 def commands() -> str:
     """Write the help of each command and of its verbs."""
-    parser = build_parser(COMMANDS)
-    blocks = []
-    for name, command in parser._subparsers._group_actions[0].choices.items():
-        blocks.append(f"\n## cloudrc {name}\n\n```text\n{command.format_help()}```\n")
-        for group in command._subparsers._group_actions if command._subparsers else ():
-            blocks += [
-                f"\n### cloudrc {name} {verb}\n\n```text\n{each.format_help()}```\n"
-                for verb, each in group.choices.items()
-            ]
-    return "".join(blocks)
+    return "".join(_helps(build_parser(COMMANDS), "## cloudrc"))
+
+
+def _helps(parser: Parser, heading: str) -> Iterator[str]:
+    """Yield the help of each command of a parser, and of the verbs below it."""
+    for name, each in parser.verbs.items():
+        yield f"\n{heading} {name}\n\n```text\n{each.format_help()}```\n"
+        yield from _helps(each, f"#{heading} {name}")
 
 
 def python() -> str:

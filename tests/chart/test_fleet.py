@@ -28,13 +28,15 @@ ONBOARD = {**ALL, "experiment": {"cloud": {"place": "onboard"}}}
 def manifests(chart, path):
     """Render with helm: (kind, name) -> text, without what is random or tells the version.
 
-    Also without the limits of probes: that of the link has grown.
+    Also without the limits of probes: that of the link has grown. And without the command
+    `process`, which containers of earlier charts did not call.
     """
     flags = ("--namespace", "lab", "--kube-version", OLDEST, "--values", str(path))
     done = helm("template", "demo", str(chart), *flags)
     assert done.returncode == 0, done.stderr
     random = (
         r"(?m)^  (key|operator|reader): .*$|^ +(helm.sh/chart|timeoutSeconds|failureThreshold): .*$"
+        r"|^ +- process\n"
     )
     texts = re.split(r"(?m)^---\n# Source: .*\n", re.sub(random, "", done.stdout))[1:]
     found = ((yaml.safe_load(each), each) for each in texts)

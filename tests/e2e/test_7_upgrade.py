@@ -2,6 +2,7 @@
 
 """A release is upgraded and rolled back in flight; one of an earlier chart restarts."""
 
+import re
 import subprocess
 
 import pytest
@@ -26,19 +27,23 @@ OLD = "cloudrc-old"
 """The release that is upgraded."""
 AUDIT = "--audit=/var/lib/cloudrc-journal/audit.jsonl"
 """An argument of earlier charts, for the images of that time."""
+PROCESS = re.compile("^( +)- (world|cloud|teleop)$", re.MULTILINE)
+"""A command of earlier charts, for the images of that time: the first argument of a container."""
 
 
 @pytest.fixture
 def chart(before, tmp_path):
-    """The earlier chart; another argument takes the place of one that today's images lack."""
+    """The earlier chart, with the commands and arguments that today's images know."""
     if before == "now":
         yield CHART
         helm("uninstall", OLD, "--wait")
         return
     packed = ROOT / "tests" / "fixtures" / "charts" / f"cloudrc-{before}.tgz"
     subprocess.run(["tar", "-xzf", packed, "-C", tmp_path], check=True)
-    cloud = tmp_path / "cloudrc" / "templates" / "cloud" / "deployment.yaml"
-    cloud.write_text(cloud.read_text().replace(AUDIT, '"--metrics=[::]:9101"'))
+    for end in ("world", "cloud"):
+        file = tmp_path / "cloudrc" / "templates" / end / "deployment.yaml"
+        text = file.read_text().replace(AUDIT, '"--metrics=[::]:9101"')
+        file.write_text(PROCESS.sub(r"\1- process\n\1- \2", text))
     yield tmp_path / "cloudrc"
     helm("uninstall", OLD, "--wait")
 

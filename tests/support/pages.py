@@ -32,7 +32,7 @@ NEEDS = {
     "a cluster": "^(kubectl|helm|kind|make|docker) |^cloudrc .* (--cluster|--release|--on|-n) ",
     "ROS": r"\bros2?\b",
     "namespaces": r"^cloudrc link exec ",
-    "a session": r"^cloudrc (up|down|console|mission|relay|replay|link set|policy serve)\b",
+    "a session": r"^cloudrc (up|down|console|mission|replay|link (set|relay)|policy serve)\b",
     "another program": r"^(?!(cloudrc|cd|mkdir|pip|python|head|kubectl|helm|kind|make|docker) )",
 }
 """What a line needs that not every test has -> how it looks."""

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from cloudrc.doors.cli.teleop import api_address
+from cloudrc.doors.cli.process_teleop import api_address
 from cloudrc.results.exposition.live import LiveMetrics
 from cloudrc.teleop import api as api_module
 from cloudrc.teleop import auth, models
@@ -271,7 +271,7 @@ def test_a_body_that_is_too_long_is_not_awaited(api):
 @pytest.mark.parametrize(("where", "host"), [("0", "127.0.0.1"), ("[::1]:0", "::1")])
 def test_a_network_address_needs_tokens(where, host, refused):
     assert api_address(where) == (host, 0)
-    line = refused(f"teleop --config hover.yaml --socket . --api {where}")
+    line = refused(f"process teleop --config hover.yaml --socket . --api {where}")
     assert "needs --tokens DIR" in line
 
 

@@ -60,7 +60,7 @@ def arguments(parser: Parser) -> None:
     pod = parser.add_argument_group("in the container of the chart")
     pod.add_argument("--config", type=Path, metavar="FILE", help="experiment file")
     pod.add_argument("--profile", type=Path, metavar="FILE", help="file of the link profile")
-    about = "folder of 'cloudrc cloud --records DIR', for the pictures of a camera"
+    about = "folder of 'cloudrc process cloud --records DIR', for the pictures of a camera"
     pod.add_argument("--records", type=Path, metavar="DIR", help=about)
     api_arguments(pod, "the API of teleop")
 

@@ -25,6 +25,7 @@ VERBS = {
     "verify": "check by measurement that a link does what its profile says",
     "set": "change the link during a flight",
     "exec": "run two programs with the link between them",
+    "relay": "carry TCP connections, or a topic of ROS 2, over the link",
     "run": "shape one direction of the link until SIGTERM",
 }
 """Verb -> its line in the help."""

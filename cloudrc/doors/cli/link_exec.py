@@ -8,9 +8,9 @@ import os
 import sys
 from pathlib import Path
 
+from cloudrc.doors.cli.link_relay import link_arguments
 from cloudrc.doors.cli.output import print_lines, tell
 from cloudrc.doors.cli.parser import Options, Parser, number, settings_from, whole_number
-from cloudrc.doors.cli.relay import link_arguments
 
 EPILOG = """\
 examples:
@@ -30,7 +30,7 @@ The model draws by packet number, and the numbers depend on timing: one seed
 gives the same kind of run, not the same bytes.
 
 Needs root or unprivileged user namespaces, and /dev/net/tun: 'cloudrc doctor'
-says what works here. Without them, use 'cloudrc relay tcp'.
+says what works here. Without them, use 'cloudrc link relay tcp'.
 
 exit codes: that of the client, or of the server if it fails first; 2 bad input,
 3 missing prerequisite, 4 the server does not listen in time, 6 the server ended

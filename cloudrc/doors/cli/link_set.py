@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 EPILOG = """\
 where:
   a run on this machine ('cloudrc up', 'cloudrc run', 'cloudrc link exec',
-  'cloudrc relay tcp'): found automatically, or named by --run
+  'cloudrc link relay tcp'): found automatically, or named by --run
   a release in a cluster: if --context, -n or --release is given, or if there is
   no run on this machine; always with 'kubectl cloudrc link set'
   If several runs fly, or ./runs/latest has ended and another flight has begun,

@@ -28,14 +28,12 @@ GROUPS: dict[str, dict[str, str]] = {
         "console": "show a flight in the browser, and steer it there",
         "ros": "show a flight to nodes of ROS 2, which may steer it",
         "replay": "watch a recorded flight in 3-D, in a browser",
-        "report": "write the report of a recorded run again",
+        "report": "write the report of a recorded run again, or recover a recording",
         "timeline": "show where the age of the commands comes from, stage by stage",
         "see": "let a perception look again at what a recorded flight saw",
-        "recover": "write a clean copy of a damaged recording",
     },
     "links": {
-        "link": "show, record, verify or change the emulated network",
-        "relay": "carry TCP connections over the emulated network",
+        "link": "show, record, verify, change or use the emulated network",
     },
     "studies": {
         "compare": "say whether a setting differs from another, and how sure that is",
@@ -53,12 +51,8 @@ GROUPS: dict[str, dict[str, str]] = {
         "rank": "rank policies over networks, with tasks and links that are fixed",
         "policy": "serve a policy that controls robots elsewhere",
     },
-    "cluster (a flight in real time here starts the last four, too)": {
+    "cluster": {
         "key": "make or replace the key that world and cloud share",
-        "world": "the robot: physics, sensors, guard, onboard controller",
-        "cloud": "the remote controller",
-        "teleop": "missions and the operator's HTTP API",
-        "cell": "the radio cell that all robots of a fleet share",
     },
     "class": {
         "class": "hand out and score the exercise for students",
@@ -66,19 +60,21 @@ GROUPS: dict[str, dict[str, str]] = {
     "set up": {
         "doctor": "check whether this machine can fly; say what to fix",
         "list": "list experiments, profiles, predictors and more",
-        "new": "write the files of a robot of your own",
-        "robot": "check a robot: facts, a flight, and what must change",
+        "new": "write a robot or a plug-in of your own that flies, and its test",
+        "check": "check a robot or a plug-in: its contract, and a flight",
         "completion": "print a completion script for your shell",
     },
 }
 """Group of commands -> command -> help line. `<command>.py` beside this file contains it."""
 MODULES = {
-    **dict.fromkeys(("world", "cloud"), "processes"),
     **dict.fromkeys(("up", "down"), "session"),
     "class": "exercise",
 }
 """Command -> the module in `cloudrc/doors/cli` that contains it, if the module has another name."""
-COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
+UNLISTED = {"process": "run one process of a flight: world, cloud, teleop or cell"}
+"""Commands that the chart and the drivers type, so that the list of `--help` leaves them out."""
+COMMANDS = {name: line for group in [*GROUPS.values(), UNLISTED] for name, line in group.items()}
+"""Command -> help line."""
 KUBECTL_PLUGIN = "kubectl-cloudrc"
 """Name of this program when kubectl starts it as a plug-in."""
 COUNT_MAX = 10_000

@@ -44,7 +44,7 @@ def arguments(parser: Parser) -> None:
     drive.add_argument(
         "--config", type=Path, required=True, metavar="FILE", help="experiment file (YAML)"
     )
-    about = "folder of the sockets of 'cloudrc cloud --teleop DIR'"
+    about = "folder of the sockets of 'cloudrc process cloud --teleop DIR'"
     drive.add_argument("--socket", type=Path, required=True, metavar="DIR", help=about)
     number_argument(drive)
     about = "write status for a supervisor to stdout (default: events only)"

@@ -1,23 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run the processes `cloudrc world` and `cloudrc cloud` of a local run or a pod."""
+"""Flags that the processes of a flight have in common, and addresses."""
 
 from __future__ import annotations
 
 import argparse
 import socket
 from pathlib import Path
-from types import SimpleNamespace
 
 from cloudrc.doors.cli.parser import (
     Arguments,
-    Options,
     Parser,
     read_size,
-    settings_from,
     whole_number,
 )
-from cloudrc.flight.drivers.process import StopSignal
 from cloudrc.flight.drivers.realtime import Address, split_address
 
 
@@ -44,7 +40,8 @@ def status_arguments(parser: Parser) -> None:
     parser.add_argument("--metrics", type=read_address, metavar="HOST:PORT", help=about)
 
 
-def _end_arguments(parser: Parser) -> None:
+def end_arguments(parser: Parser) -> None:
+    """Declare the flags that world and cloud have in common."""
     process_arguments(parser)
     about = "MCAP file to record to; an existing one becomes NAME.before.mcap"
     parser.add_argument("--record", type=Path, required=True, metavar="FILE", help=about)
@@ -62,14 +59,6 @@ def _end_arguments(parser: Parser) -> None:
     parser.add_argument("--route", type=Path, required=True, metavar="FILE", help=about)
     about = "where to send without a link process; to robot 0's PORT, the number is added"
     parser.add_argument("--peer", type=read_address, metavar="HOST:PORT", help=about)
-
-
-def _cloud_arguments(parser: Parser) -> None:
-    _end_arguments(parser)
-    about = "folder of the sockets of 'cloudrc teleop --socket DIR'"
-    parser.add_argument("--teleop", type=Path, required=True, metavar="DIR", help=about)
-    about = "folder of the sockets of programs that read cloud's records (default: that of teleop)"
-    parser.add_argument("--records", type=Path, metavar="DIR", help=about)
 
 
 def read_address(text: str) -> Address:
@@ -90,21 +79,3 @@ def _has_ipv6() -> bool:
     except OSError:
         return False
     return True
-
-
-def _run_world(options: Options) -> None:
-    stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
-    from cloudrc.flight.processes.ends import EndSettings, run_world
-
-    run_world(settings_from(options, EndSettings), stop)
-
-
-def _run_cloud(options: Options) -> None:
-    stop = StopSignal()
-    from cloudrc.flight.processes.ends import EndSettings, run_cloud
-
-    run_cloud(settings_from(options, EndSettings), options.teleop, options.records, stop)
-
-
-world = SimpleNamespace(arguments=_end_arguments, execute=_run_world)
-cloud = SimpleNamespace(arguments=_cloud_arguments, execute=_run_cloud)

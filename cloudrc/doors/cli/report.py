@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""`cloudrc report RUN`: write the report of a recorded run again, and print a summary."""
+"""`cloudrc report RUN`: write the report of a recorded run again, and print a summary.
+
+With `--recover`, `report_recover.py` copies its recordings instead.
+"""
 
 from __future__ import annotations
 
@@ -27,12 +30,17 @@ examples:
   cloudrc report runs/latest
   cloudrc report runs/latest --metric ./overshoot.py
   cloudrc report runs/latest --figures --width 3.5 --font-size 8
-  cloudrc report runs/paper-local-seed1-1 -o json"""
+  cloudrc report runs/paper-local-seed1-1 -o json
+  cloudrc report world.mcap --recover           writes world.recovered.mcap
+
+exit codes of --recover: 0 copied, and what is missing is printed, 2 nothing
+  readable, or still in flight"""
 
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run")
+    about = "the folder of a run; with --recover also one recording, FILE.mcap"
+    parser.add_argument("run", type=Path, metavar="RUN", help=about)
     about = (
         "also evaluate the metric in this Python file; repeatable. Files named by the run's"
         " configuration are never executed"
@@ -40,6 +48,10 @@ def arguments(parser: Parser) -> None:
     parser.add_argument("--metric", action="append", default=[], metavar="FILE", help=about)
     files_argument(parser)
     figure_arguments(parser, 7.16)
+    about = "write no report, but a clean copy of a damaged recording"
+    parser.add_argument("--recover", action="store_true", help=about)
+    about = "file for this copy (default: beside it, with '.recovered' before its ending)"
+    parser.add_argument("-t", "--to", type=Path, metavar="NEW", help=about)
     output_argument(parser)
 
 
@@ -58,6 +70,13 @@ def files_argument(parser: Parser) -> None:
 
 def execute(options: Options) -> int:
     """Write the report from the recording; return the exit code of the run's verdict."""
+    if options.recover:
+        from cloudrc.doors.cli.report_recover import recover
+
+        recover(options)
+        return 0
+    if options.to:
+        raise BadInputError("--to: is the file of --recover; give both")
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
     look = options.width, options.font_size

@@ -51,9 +51,8 @@ def arguments(parser: Parser) -> None:
     pod = bridge.add_argument_group("in the container of the chart")
     pod.add_argument("--config", type=Path, metavar="FILE", help="experiment file")
     number_argument(pod)
-    pod.add_argument(
-        "--records", type=Path, metavar="DIR", help="folder of 'cloudrc cloud --records DIR'"
-    )
+    about = "folder of 'cloudrc process cloud --records DIR'"
+    pod.add_argument("--records", type=Path, metavar="DIR", help=about)
     api_arguments(pod, "the API of teleop; without a token, nodes cannot steer")
 
 

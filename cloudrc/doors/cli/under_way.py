@@ -41,7 +41,7 @@ def find_run(
     Args:
         run: Folder of the run; None if the user names none.
         steers: Whether the command changes the flight.
-        links: Whether the command can also use a link of `link exec` or `relay tcp`.
+        links: Whether the command can also use a link of `link exec` or `link relay tcp`.
         elsewhere: Whether to take a run outside of the working folder that the user has not named.
 
     Returns:

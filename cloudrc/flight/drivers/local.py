@@ -230,6 +230,7 @@ class LocalRun:
         self._start(
             robot.folder,
             name,
+            "process",
             name,
             *(["--record-flights"] if self._session else []),
             listen=robot.at[name],
@@ -248,6 +249,7 @@ class LocalRun:
         self._start(
             folder,
             "teleop",
+            "process",
             "teleop",
             *words,
             f"--api-file={folder / API_FILE}",

@@ -81,7 +81,8 @@ class LocalFleet(LocalRun):
         ways = {"uplink": first["uplink"], "downlink": first["downlink"]}
         ends = {"worlds": first["world"], "clouds": first["cloud"]}
         count, record = max(self._robots) + 1, self._folder / CELL_FILE
-        self._start(self._folder, "cell", "cell", robots=count, record=record, **ways, **ends)
+        words = "process", "cell"
+        self._start(self._folder, "cell", *words, robots=count, record=record, **ways, **ends)
 
 
 def _write(folder: Path, way: str, name: str, address: str) -> None:

@@ -65,7 +65,7 @@ def control_groups() -> list[tuple[str, Path]]:
 
 
 def interpreter(*words: str) -> list[str]:
-    """Build a command line for this Python interpreter, for example with `-m cloudrc world`.
+    """Build a command line for this Python interpreter, such as with `-m cloudrc process world`.
 
     The new process imports modules from the working folder only if this process does: the folder
     may contain files from somebody else.

@@ -24,7 +24,7 @@ MTU = 1500  # longest IP packet on the link [bytes]
 DEVICE = "cloudrc"
 TUN = "/dev/net/tun"
 QUEUE_PACKETS = 1_000  # packets that wait in a device until the relay reads them
-OTHERWISE = "or use 'cloudrc relay tcp', which needs no privileges"
+OTHERWISE = "or use 'cloudrc link relay tcp', which needs no privileges"
 """End of every message about missing privileges."""
 
 

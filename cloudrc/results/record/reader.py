@@ -302,7 +302,7 @@ def read(
         take(content.messages)
         content.messages = []
     if whole and content.lacking:
-        copy = f"to copy what is readable: cloudrc recover {quote(str(path))}"
+        copy = f"to copy what is readable: cloudrc report {quote(str(path))} --recover"
         raise BadInputError(f"{path}: {content.lacking}; {copy}")
     return content
 

@@ -61,13 +61,20 @@ def _warnings(report: Mapping[str, Any], paint: Paint) -> Iterable[str]:
 
 
 def main_numbers(numbers: Mapping[str, Number]) -> list[tuple[str, str, str]]:
-    """Return label, digits and unit of each number with a label that was measured."""
+    """Return label, digits and unit of each number with a label that was measured.
+
+    The metrics of the user and of installed packages follow, under their own names.
+    """
     # A mission with a last setpoint has no waypoints.
     hidden = "waypoints_reached" if "final_error" in numbers else None
-    return [
-        (metric.label, *readable(metric.name, numbers[metric.name]))
+    labels = {
+        metric.name: metric.label
         for metric in in_groups()
-        if metric.label and metric.name in numbers and metric.name != hidden
+        if metric.label and metric.name != hidden
+    }
+    labels |= {name: name for name in sorted(numbers.keys() - SHIPPED)}
+    return [
+        (label, *readable(name, numbers[name])) for name, label in labels.items() if name in numbers
     ]
 
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""`cloudrc relay ros` puts a link between two topics: `make ros2-test` runs these tests."""
+"""`cloudrc link relay ros` puts a link between two topics: `make ros2-test` runs these tests."""
 
 import json
 import subprocess
@@ -24,7 +24,7 @@ if find_spec("rclpy"):
 
     LOSSY = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
     SAFE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-WORDS = ["relay", "ros", "--from", "/odom", "--to", "/remote/odom"]
+WORDS = ["link", "relay", "ros", "--from", "/odom", "--to", "/remote/odom"]
 PROFILE = {"uplink": {"delay_ms": 70, "jitter_ms": 40, "loss": 0.05, "duplicate": 0.05}}
 PERIOD = 0.005  # between two messages [s]
 

@@ -8,7 +8,7 @@ EVIL = "x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run
 SHOWN = r"x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
 
 
-@pytest.mark.parametrize("words", ["run", "report", "recover", "link show"])
+@pytest.mark.parametrize("words", ["run", "report", "report --recover", "link show"])
 def test_a_name_in_an_error(words, refused):
     line = refused(words, EVIL)
     assert SHOWN in line

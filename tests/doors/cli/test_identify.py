@@ -91,10 +91,10 @@ def test_a_flight_whose_recording_is_still_written_is_not_read(tmp_path, call, r
     with McapWriter(mission, clock="world") as writer:
         writer.write(records())
         writer.flush()
-        for line in ("identify", "link record -o t.csv", "replay --no-open", "recover"):
+        for line in ("identify", "link record -o t.csv", "replay --no-open", "report --recover"):
             assert f"{tmp_path}: the flight has not ended" in refused(line, mission)
         assert "the flight has not ended" in refused("report", tmp_path)
-    call("recover", mission)
+    call("report --recover", mission)
 
 
 def test_the_command_writes_a_model_that_a_predictor_takes(tmp_path, call, as_json):

@@ -10,9 +10,10 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.base.errors import BadInputError
-from cloudrc.doors.cli.link import VERBS
+from cloudrc.doors.cli import link, link_relay, process
 from cloudrc.doors.cli.main import INTERNAL, main
 from cloudrc.doors.cli.parser import COMMANDS, GROUPS
+from cloudrc.doors.new import NEW
 from tests.support.commands import python
 
 HEAVY = ("numpy", "mujoco", "matplotlib", "pydantic", "yaml", "kubernetes", "rosbags", "mcap")
@@ -41,7 +42,12 @@ def test_the_list_names_all_onboard_controllers_without_numpy_or_physics():
     assert names == ["diff_drive", "multirotor", "pelican/onboard.py"]
 
 
-@pytest.mark.parametrize("command", ["", *COMMANDS, *(f"link {verb}" for verb in VERBS)])
+VERBS = {"link": link.VERBS, "link relay": link_relay.VERBS, "process": process.VERBS, "new": NEW}
+
+
+@pytest.mark.parametrize(
+    "command", ["", *COMMANDS, *(f"{name} {verb}" for name in VERBS for verb in VERBS[name])]
+)
 def test_help_fits_80_columns(command, capsys):
     with pytest.raises(SystemExit) as end:
         main([*command.split(), "--help"])
@@ -49,7 +55,9 @@ def test_help_fits_80_columns(command, capsys):
     assert end.value.code == 0
     assert max(map(len, text.splitlines())) <= 80
     if not command:
-        assert all(name in text for name in COMMANDS)
+        listed = {line.split()[0] for line in text.splitlines() if line.startswith("  ")}
+        assert COMMANDS.keys() - listed == {"process"}, "which the chart and the drivers type"
+        assert len(COMMANDS) <= 31
         assert list(GROUPS)[:4] == ["fly and steer", "links", "studies", "policies"]
         assert main([]) == 0, "no argument prints help, too"
         assert capsys.readouterr().out == text
@@ -59,6 +67,8 @@ def test_help_fits_80_columns(command, capsys):
     ("line", "words"),
     [
         ("rnu", "did you mean run?"),
+        ("world --config x.yaml", "no choice named 'world'"),
+        ("process wrld", "did you mean world?"),
         ("link show --sed 3", "--sed; did you mean --seed?; see 'cloudrc link show --help'"),
         ("bench --repeats 0", "'0' is not a whole number >= 1 and <= 10000"),
     ],

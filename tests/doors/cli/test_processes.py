@@ -57,7 +57,7 @@ def test_an_end_stopped_at_its_start_completes_its_recording(end, key, tmp_path,
     (tmp_path / "key").chmod(0o644)
     flags = f"--listen 127.0.0.1:{free_ports(1)[0]} --route route {key} --record end.mcap"
     flags += " --teleop teleop" if end == "cloud" else ""
-    errors = call(f"{end} --config hover {flags}").err
+    errors = call(f"process {end} --config hover {flags}").err
     assert (tmp_path / "end.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
     assert f"warning: {tmp_path / 'key'} can be read by others: chmod 600" in errors
 
@@ -80,7 +80,7 @@ def test_cloud_without_a_supervisor_ends_if_its_controller_is_lost(key, monkeypa
     monkeypatch.setattr(ends, "bind", bind)
     monkeypatch.setattr(assembly, "build_cloud", build_lost)
     flags = f"--listen 127.0.0.1:{free_ports(1)[0]} --route route {key} --record end.mcap"
-    line = refused(f"cloud --config hover {flags} --teleop teleop", code=5)
+    line = refused(f"process cloud --config hover {flags} --teleop teleop", code=5)
     assert line == "cloudrc: error: no node answers\n"
     bound[0].close()  # as at the end of the process
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""`cloudrc new robot` and `cloudrc robot check`."""
+"""`cloudrc new robot` and `cloudrc check`."""
 
 import runpy
 import shutil
@@ -13,7 +13,7 @@ from cloudrc.config.shipped import FOLDERS
 @pytest.fixture
 def mine(tmp_path, call):
     folder = tmp_path / "my_robot"
-    assert f"cloudrc robot check {folder}" in call("new robot", folder).out
+    assert f"cloudrc check {folder}" in call("new robot", folder).out
     return folder
 
 
@@ -41,7 +41,7 @@ def wheeled(tmp_path):
 def test_the_check_lets_a_robot_with_wheels_turn(wheeled, as_json, onboard, count):
     given = f"onboard: {{name: diff_drive, {onboard}}}"
     replace(wheeled / "robot.yaml", "onboard: diff_drive", given)
-    found = as_json("robot check", wheeled, code=2 * count)["changes"]
+    found = as_json("check", wheeled, code=2 * count)["changes"]
     assert [("to its left" in text, "turn_rate_max" in text) for text in found] == [
         (True,) * 2
     ] * count
@@ -51,7 +51,7 @@ def test_a_planar_robot_that_does_not_rest_at_the_height_of_the_spawn_is_refused
     replace(wheeled / "robot.xml", 'size=".08 .01"', 'size=".03 .01"')
     replace(wheeled / "robot.xml", 'pos="-.2 0 -.07"', 'pos="-.2 0 -.02"')
     run = f"run pillars --mode virtual --out run --set world.robot={wheeled}"
-    for command in (f"robot check {wheeled}", run):
+    for command in (f"check {wheeled}", run):
         assert "rests at a height of 0.050" in refused(command)
 
 
@@ -62,7 +62,7 @@ def test_a_folder_with_files_stays_as_it_is(mine, refused):
 
 
 def test_a_new_robot_needs_no_change(mine, as_json):
-    found = as_json("robot check", mine)
+    found = as_json("check", mine)
     assert found["ok"]
     assert found["facts"]["mass_kg"] == pytest.approx(1.3)
     assert found["facts"]["rotors_turn"]["front_right"] == "clockwise"
@@ -72,7 +72,7 @@ def test_a_new_robot_needs_no_change(mine, as_json):
 
 @pytest.mark.parametrize("robot", ["pelican", "nano", "rover"])
 def test_a_shipped_robot_needs_no_change(robot, call, tmp_path):
-    assert "nothing must change" in call("robot check", robot).out
+    assert "nothing must change" in call("check", robot).out
     assert list(tmp_path.iterdir()) == []
 
 
@@ -106,7 +106,7 @@ def build(model):
     (mine / "own.py").write_text(law + own.replace("{0}", "return commands"))
     (mine / "turns.py").write_text(own.replace("{0}", "return (8.0, 8.0, 0.0, 0.0)"))
     replace(mine / "robot.yaml", old, new)
-    out = call("robot check", mine, code=2).out
+    out = call("check", mine, code=2).out
     (line,) = [each for each in out.splitlines() if each.startswith("must change: ")]
     assert shown in line
 
@@ -120,4 +120,4 @@ def build(model):
 )
 def test_a_model_that_cannot_fly_is_refused_in_one_line(mine, refused, old, new, shown):
     replace(mine / "robot.xml", old, new)
-    assert shown in refused("robot check", mine)
+    assert shown in refused("check", mine)

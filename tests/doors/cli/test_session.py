@@ -18,9 +18,9 @@ from websockets.sync.client import connect
 from cloudrc.config.load import load_experiment, read_experiment
 from cloudrc.config.resolved import dump
 from cloudrc.doors.cli import session
+from cloudrc.flight.drivers import local
 from cloudrc.flight.drivers.machine import usable_cores
 from cloudrc.flight.drivers.realtime import free_ports
-from cloudrc.flight.drivers import local
 from cloudrc.results import under_way
 from cloudrc.results.record.columns import Recording
 from cloudrc.teleop.client import Api, ApiError

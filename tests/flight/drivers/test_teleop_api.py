@@ -27,7 +27,9 @@ def test_idle_connections_do_not_lock_a_stop_out(tmp_path):
     (tmp_path / "config.yaml").write_text(dump(load_experiment("hover")))
     (tmp_path / "operator").write_text(TOKEN)
     (tmp_path / "operator").chmod(0o644)
-    words = "-m cloudrc teleop --config config.yaml --socket . --tokens . --api-file api.json"
+    words = (
+        "-m cloudrc process teleop --config config.yaml --socket . --tokens . --api-file api.json"
+    )
     command = [sys.executable, *words.split(), "--api", "[::1]:0"]
     shell = ["bash", "-c", f'ulimit -Sn {FILES}; exec "$@"', "bash", *command]
     process = subprocess.Popen(shell, cwd=tmp_path, stderr=subprocess.PIPE, text=True)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""`cloudrc relay tcp` between real sockets of this machine."""
+"""`cloudrc link relay tcp` between real sockets of this machine."""
 
 import hashlib
 import json
@@ -59,7 +59,7 @@ class Relayed:
     def __init__(self, port, *flags):
         (self.port,) = free_ports(1)
         listen = ("--listen", f"127.0.0.1:{self.port}")
-        words = (sys.executable, "-m", "cloudrc", "relay", "tcp", *listen)
+        words = (sys.executable, "-m", "cloudrc", "link", "relay", "tcp", *listen)
         more = ("--to", f"127.0.0.1:{port}", "-o", "json", *flags)
         pipe = subprocess.PIPE
         self.process = subprocess.Popen((*words, *more), stdout=pipe, stderr=pipe, text=True)

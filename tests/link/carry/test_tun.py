@@ -127,5 +127,5 @@ def test_a_machine_that_refuses_namespaces_names_the_relay_without_privileges(mo
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(namespace, "_unshare", refuse)
-    with pytest.raises(MissingPrerequisiteError, match="cloudrc relay tcp"):
+    with pytest.raises(MissingPrerequisiteError, match="cloudrc link relay tcp"):
         namespace.enter()

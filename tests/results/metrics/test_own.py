@@ -78,6 +78,17 @@ def test_a_later_report_measures_a_file_only_if_named(folder, monkeypatch, call)
     assert "exits.py" in first["traceback"]
 
 
+def test_the_summary_of_run_and_report_has_own_metrics_with_their_units(folder, monkeypatch, call):
+    monkeypatch.setattr("cloudrc.results.report.write._draw", lambda *given, **wanted: None)
+    flown = call("run", *SHORT, "--set", "report.metrics=mine/overshoot.py", "--out", "run").out
+    again = call("report run --metric=mine/overshoot.py").out
+    for said in (flown, again):
+        (line,) = [each.split() for each in said.splitlines() if "overshoot" in each]
+        assert (line[0], len(line), line[2] in ("m", "mm")) == ("overshoot", 3, True)
+        assert float(line[1]) >= 0.0
+    assert "overshoot is not measured" in call("report run").out
+
+
 @pytest.mark.parametrize(
     ("names", "text", "reason"),
     [

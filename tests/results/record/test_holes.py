@@ -83,5 +83,7 @@ def test_the_last_mission_of_a_killed_session_and_of_its_copy_are_whole_alike(
 
 
 def test_a_damaged_file_is_refused_where_a_whole_one_is_needed(path):
-    with pytest.raises(BadInputError, match=r"damaged at byte .*cloudrc recover .*x\.mcap$"):
+    with pytest.raises(
+        BadInputError, match=r"damaged at byte .*cloudrc report .*x\.mcap --recover$"
+    ):
         open_recording(without(path, [1]))

@@ -6,6 +6,7 @@ import io
 import json
 import re
 from contextlib import suppress
+from pathlib import Path
 from random import Random
 
 import pytest
@@ -100,7 +101,7 @@ def test_a_file_without_a_message_is_named(path, refused, data, reason):
     path.write_bytes(data)
     with pytest.raises(BadInputError, match=rf"^[^\n]*x\.mcap: {reason}[^\n]*$"):
         Recording.read(path)
-    assert re.search(reason, refused("recover", path))
+    assert re.search(reason, refused("report --recover", path))
     assert not path.with_name("x.recovered.mcap").exists()
 
 
@@ -202,11 +203,13 @@ def test_a_file_is_read_up_to_its_first_damage(path, data):
 def test_the_command_says_what_is_copied_and_missing(path, call, refused):
     new = path.with_name("new.mcap")
     path.write_bytes(WHOLE)
-    assert f"kept {len(MESSAGES)} messages, 1 attachments" in call("recover", path).out
+    assert f"kept {len(MESSAGES)} messages, 1 attachments" in call("report --recover", path).out
     path.write_bytes(WHOLE[: CHUNKS[0][1] + 100])
-    assert "missing: cut short: " in call("recover", path, "-t", path.with_name("a.mcap")).out
-    account = json.loads(call("recover -o json", path, "--to", new).out)
-    assert (account["schemaVersion"], account["complete"]) == (1, False)
+    to = path.with_name("a.mcap")
+    assert "missing: cut short: " in call("report --recover", path, "-t", to).out
+    found = json.loads(call("report --recover -o json", path, "--to", new).out)
+    (account,) = found["recordings"]
+    assert (found["schemaVersion"], account["complete"]) == (1, False)
     assert account["kept"]["messages"] == sum(account["topics"].values()) == SIZES[0]
     assert 0 < account["bytes_lost"] <= 100
     assert account["notes"] == [Recording.read(new).note]
@@ -214,4 +217,23 @@ def test_the_command_says_what_is_copied_and_missing(path, call, refused):
         (new, "already there; name another file with --to"),
         (new / "none", "Not a directory"),
     ):
-        assert f"{target}: {reason}" in refused("recover", path, "-t", target)
+        assert f"{target}: {reason}" in refused("report --recover", path, "-t", target)
+
+
+def test_of_a_run_its_recording_is_copied_or_those_of_both_ends(tmp_path, as_json, refused):
+    run = tmp_path / "run"
+    run.mkdir()
+    assert "name the folder of a run" in refused("report --recover", run)
+    ends = [run / "world.mcap", run / "cloud.mcap"]
+    for end in ends:
+        end.write_bytes(WHOLE)
+    assert "--to: names one file" in refused("report --recover --to new.mcap", run)
+
+    def copies():
+        found = as_json("report --recover", run)["recordings"]
+        return [Path(each["file"]).name for each in found]
+
+    assert copies() == ["world.recovered.mcap", "cloud.recovered.mcap"]
+    (run / "mission.mcap").write_bytes(WHOLE)
+    assert copies() == ["mission.recovered.mcap"]
+    assert "is the file of --recover" in refused("report --to new.mcap", run)

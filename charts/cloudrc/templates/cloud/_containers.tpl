@@ -11,6 +11,7 @@
   image: {{ $image }}
   imagePullPolicy: {{ .Values.image.pullPolicy }}
   args:
+    - process
     - cloud
     - --config=/etc/cloudrc/experiment.yaml
     {{- include "cloudrc.endArgs" (dict "root" . "component" "cloud") | nindent 4 }}
@@ -45,6 +46,7 @@
   image: {{ $image }}
   imagePullPolicy: {{ .Values.image.pullPolicy }}
   args:
+    - process
     - teleop
     - --config=/etc/cloudrc/experiment.yaml
     {{- with include "cloudrc.robotArg" . }}

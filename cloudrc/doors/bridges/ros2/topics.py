@@ -46,7 +46,7 @@ def relay_topic(settings: TopicSettings, tell: Callable[[str], None]) -> Report:
     Raises:
         CloudrcError: If the profile or a topic cannot be used, or ROS 2 and the type are missing.
     """
-    require_ros("relay ros", "relay", "rclpy")
+    require_ros("link relay ros", "relay", "rclpy")
     from cloudrc.doors.bridges.ros2.relay import TopicRelay
 
     way = settings.direction
@@ -56,7 +56,7 @@ def relay_topic(settings: TopicSettings, tell: Callable[[str], None]) -> Report:
         stack.callback(relay.close)
         link = LiveLink(
             settings,
-            "relay ros",
+            "link relay ros",
             tell,
             stack,
             output=settings.out,

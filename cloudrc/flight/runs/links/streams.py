@@ -37,7 +37,7 @@ class RelaySettings(CarrySettings):
 def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str, Any]:
     """Relay connections until a signal interrupts; return counts, and the times of turns [s]."""
     with contextlib.ExitStack() as stack:
-        link = LiveLink(settings, "relay tcp", tell, stack, check=check_keys)
+        link = LiveLink(settings, "link relay tcp", tell, stack, check=check_keys)
         family, to = _find(settings.to)
         listening = stack.enter_context(_listen(settings.listen))
         where = show_address(listening.getsockname()[:2])

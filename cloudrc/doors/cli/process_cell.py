@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run `cloudrc cell`: the process through which the packets of a fleet pass."""
+"""Run `cloudrc process cell`: the process through which the packets of a fleet pass."""
 
 from __future__ import annotations
 

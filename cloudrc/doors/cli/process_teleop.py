@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run `cloudrc teleop`: the process that stores and commands missions and serves the API."""
+"""Run `cloudrc process teleop`: it stores and commands missions, and serves the API."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from cloudrc.flight.drivers.realtime import Address
 from cloudrc.flight.runs.requirements import require
 
 EPILOG = """\
-teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. It ends
-on SIGTERM, on Ctrl-C and when its parent process has ended; with --start also
-after the mission. A flying robot then holds; a new teleop with the same
---journal resumes the mission.
+teleop talks to 'cloudrc process cloud --teleop DIR' through two sockets in DIR.
+It ends on SIGTERM, on Ctrl-C and when its parent process has ended; with
+--start also after the mission. A flying robot then holds; a new teleop with the
+same --journal resumes the mission.
 
 /openapi.json describes the API. The API asks for a token, except on a socket
 file, which only its owner can open. To make a token that only you can read:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run `cloudrc relay`: the emulated link for TCP connections, or for a topic of ROS 2."""
+"""Run `cloudrc link relay`: the emulated link for TCP connections, or for a topic of ROS 2."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ VERBS = {
     "ros": "carry a topic of ROS 2 to another topic over the emulated link",
 }
 """Verb -> its line in the help."""
+EPILOG = None
 TCP_EPILOG = """\
 example:
-  cloudrc relay tcp --listen 127.0.0.1:8001 --to gpu:8000 --link lte
+  cloudrc link relay tcp --listen 127.0.0.1:8001 --to gpu:8000 --link lte
   cloudrc link set downlink.delay_ms=120      (meanwhile, in another terminal)
 
 A client connects to --listen instead of the server. The uplink leads to the
@@ -36,17 +37,20 @@ use it where it works."""
 
 ROS_EPILOG = """\
 examples:
-  cloudrc relay ros --from /odom --to /remote/odom --link lte
-  cloudrc relay ros --from /remote/cmd_vel --to /cmd_vel --link lte --direction downlink
+  cloudrc link relay ros --from /odom --to /remote/odom --link lte
+  cloudrc link relay ros --from /remote/cmd_vel --to /cmd_vel --link lte \\
+      --direction downlink
   cloudrc link set uplink.delay_ms=120      (meanwhile, in another terminal)
 
-Each message is a packet of the link. A message above 1200 bytes is several: of a
-BEST_EFFORT topic it is lost with any of them, of a RELIABLE one it is repaired,
-and late. The relay waits for a node that publishes --from, and takes its type. Ctrl-C ends the
-relay, and prints what the profile asks for and what was measured.
+Each message is a packet of the link. A message above 1200 bytes is several: of
+a BEST_EFFORT topic it is lost with any of them, of a RELIABLE one it is
+repaired, and late. The relay waits for a node that publishes --from, and takes
+its type. Ctrl-C ends the relay, and prints what the profile asks for and what
+was measured.
 
 A subscription that wants RELIABLE hears the relay only with --reliable: then
-ROS repeats what it loses itself, but not the small messages that the link loses.
+ROS repeats what it loses itself, but not the small messages that the link
+loses.
 
 Needs a sourced ROS 2, exit code 3 without it."""
 
