@@ -19,7 +19,7 @@ from cloudrc.base.outside.document import write_yaml
 from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.config.shipped import file_of
 from cloudrc.doors.cli.main import main
-from cloudrc.flight.runs.interrupts import forget_interrupt
+from cloudrc.flight.interrupts import forget_interrupt
 from tests.support.sweeps import GRID, SHORT
 
 ROOT = Path(__file__).resolve().parents[1]

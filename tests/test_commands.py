@@ -7,7 +7,7 @@ import re
 import pytest
 
 from cloudrc.doors.cli.parser import build_parser
-from cloudrc.flight.runs.experiment import load
+from cloudrc.flight.experiment import load
 from tests.conftest import nightly
 from tests.support.pages import ROOT, SHELL, blocks_of, commands_of
 from tests.test_docs import PAGES

@@ -193,7 +193,7 @@ def test_the_wheel_alone_lists_then_flies_and_hands_out_the_exercise(built, tmp_
 
 BASE = """
 import importlib.util, sys
-from cloudrc.flight.runs.requirements import EXTRAS
+from cloudrc.base.requirements import EXTRAS
 
 gone = {module for modules in EXTRAS.values() for module in modules}
 found = importlib.util.find_spec

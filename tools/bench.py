@@ -33,8 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.base.text import table
-from cloudrc.flight.runs.bench import FLIGHTS, STEPS
 from cloudrc.gym import Channel, Networked
+from cloudrc.studies.bench import FLIGHTS, STEPS
 
 ROOT = Path(__file__).parents[1]
 FLIGHTS_MIN = 12

@@ -26,8 +26,8 @@ from pathlib import Path
 from random import Random
 
 from cloudrc.base.text import table
-from cloudrc.flight.drivers.machine import interpreter
-from cloudrc.flight.drivers.realtime import free_ports
+from cloudrc.flight.machine import interpreter
+from cloudrc.flight.pod.realtime import free_ports
 from cloudrc.wire.tunnel.codec import SIZES, Kind, encode_header, peek
 
 EXPERIMENT = """\

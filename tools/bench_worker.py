@@ -25,10 +25,10 @@ from typing import Any
 
 LIMIT_NS = 300_000_000_000
 """Time limit of a flight of the part "loop" [ns], virtual time."""
-FLY_POINT = "cloudrc.flight.runs.flight", "cloudrc.runs.flight"
+FLY_POINT = "cloudrc.flight.in_memory", "cloudrc.runs.flight"
 WORKERS = "cloudrc.flight.trials.workers", "cloudrc.trials.workers"
-VIRTUAL = "cloudrc.flight.drivers.virtual", "cloudrc.drivers.virtual"
-ASSEMBLY = "cloudrc.flight.assembly", "cloudrc.assembly"
+VIRTUAL = "cloudrc.flight.virtual.run", "cloudrc.drivers.virtual"
+ASSEMBLY = "cloudrc.flight.virtual.flight", "cloudrc.assembly"
 """Where the modules that fly are today, and where they were in older commits."""
 marks: list[float] = []
 """Processor time of this thread when the flight began, and every 100 ms of virtual time [s]."""

@@ -14,9 +14,9 @@ from types import FrameType
 from typing import Any
 
 from cloudrc.config.load import load_experiment
-from cloudrc.flight.assembly import assemble
-from cloudrc.flight.runs.bench import flight
+from cloudrc.flight.virtual.flight import assemble
 from cloudrc.flight.warnings import advise
+from cloudrc.studies.bench import flight
 
 
 def count(

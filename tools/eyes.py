@@ -20,8 +20,8 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from cloudrc.base.statistics import median_interval
-from cloudrc.flight.runs.experiment import load, robots_of
-from cloudrc.flight.runs.fleet import fly_fleet
+from cloudrc.flight.experiment import load, robots_of
+from cloudrc.flight.fleet import fly_fleet
 from cloudrc.results.report.figures import own_settings, save
 from cloudrc.results.report.figures.style import BLUE, GREY, VERMILION, Look, new_figure, panel
 from tools.markdown import table

@@ -42,7 +42,7 @@ PACKAGES = {
     "perceptions": "cloudrc.cloud.perceptions",
     "onboard": "cloudrc.robots.onboard",
     "executors": "",
-    "transports": "cloudrc.flight.drivers.transports",
+    "transports": "cloudrc.flight.pod.transports",
     "motion": "",
     "metrics": "",
     "policies": "",

@@ -19,8 +19,8 @@ SUFFIXES = (".py", ".c", ".h", ".xml", ".yaml")
 _NOT_FLOWN = {
     "": "_chart doors cluster",
     # Of studies, what asks for rows, orders and shows them; the rest makes rows.
-    "studies/": "capacity capacity_text check compare compare_text compute exercise figure identify "
-    "margin place pods search stability sweep",
+    "studies/": "bench capacity capacity_text check compare compare_text compute cpu_limit "
+    "exercise figure identify margin place pods search stability sweep",
     "studies/eval/": "page provenance",
     "studies/policy/": "serve",
     "studies/rank/": "entry page score",

@@ -29,7 +29,7 @@ from cloudrc.config.load import load_link, read_experiment, robot_settings
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.config.schema import MissionConfig
-from cloudrc.flight.runs.session import experiment_of
+from cloudrc.flight.session import experiment_of
 from cloudrc.link.follow import PROFILE
 from cloudrc.results.record.columns import Recording
 from cloudrc.results.record.merge import cut_to_last_mission, merge

@@ -34,7 +34,7 @@ from cloudrc.cluster.client import (
     run,
 )
 from cloudrc.cluster.releases import CLOUDRC, COMPONENT, INSTANCE, no_release
-from cloudrc.flight.drivers.machine import STOP_LIMIT, end_process
+from cloudrc.flight.machine import STOP_LIMIT, end_process
 from cloudrc.results.record import part_before
 
 NO_IMAGE = ("ErrImagePull", "ImagePullBackOff", "ErrImageNeverPull", "InvalidImageName")

@@ -20,8 +20,8 @@ from cloudrc.base.errors import TimedOutError
 from cloudrc.base.outside.prometheus import read_metrics
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.pods import METRICS, find_pod, forwarded
-from cloudrc.flight.runs.links.under_test import LOOPBACK, WAYS
-from cloudrc.flight.runs.links.verify import Report, fetch, make_report
+from cloudrc.flight.links.under_test import LOOPBACK, WAYS
+from cloudrc.flight.links.verify import Report, fetch, make_report
 from cloudrc.link.verify.causes import Findings, read_evidence
 from cloudrc.link.verify.judge import Judgement
 

@@ -2,7 +2,7 @@
 
 """Faults that an experiment injects: their keys, and what they do to the link's schedule.
 
-`cloudrc.flight.drivers.faults` injects those of processes and clocks.
+`faults.py` in `flight/virtual/` and in `flight/local/` injects those of processes and clocks.
 """
 
 from __future__ import annotations

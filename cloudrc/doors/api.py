@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 from cloudrc.base.errors import CloudrcError, InterruptedRunError, NothingFlownError
 from cloudrc.base.outside.refusal import check_names, naming
 from cloudrc.base.outside.values import Quantity, to_plain
+from cloudrc.base.requirements import MODES, require
 from cloudrc.config.resolved import ResolvedExperiment, dump
-from cloudrc.flight.runs.experiment import advice_on, check_mode, load
-from cloudrc.flight.runs.flight import fly_in_memory
-from cloudrc.flight.runs.folder import point_to, run_folder
-from cloudrc.flight.runs.requirements import MODES, require
+from cloudrc.flight.experiment import advice_on, check_mode, load
+from cloudrc.flight.folder import point_to, run_folder
+from cloudrc.flight.in_memory import fly_in_memory
 from cloudrc.results.metrics.flight import Columns, Flight
 from cloudrc.results.metrics.response import Step, steps
 from cloudrc.results.metrics.verdict import FlightFailure
@@ -179,7 +179,7 @@ def fly(
 
 
 def _fly_here(experiment: ResolvedExperiment, mode: str, out: str | Path | None) -> Result:
-    from cloudrc.flight.runs.fly import fly
+    from cloudrc.flight.fly import fly
 
     folder = run_folder(experiment, mode, None if out is None else Path(out))
     return _read(experiment, folder, fly(experiment, mode, folder))
@@ -401,7 +401,7 @@ def verify(
         with naming("seconds"):
             SECONDS.of(seconds)
     if mode == "local":
-        from cloudrc.flight.runs.links.verify import verify as measure
+        from cloudrc.flight.links.verify import verify as measure
 
         return measure(target, _texts(settings or {}), shaper=shaper, seconds=seconds)
     require("mode cluster", ("kube",))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.config.link_schedule import find_ways
-from cloudrc.flight.assembly import build_compute_time
+from cloudrc.flight.assembly.cloud import build_compute_time
 from cloudrc.link.draws import BLOCK, OVERTAKES, impairments, stream_key
 from cloudrc.link.model import LinkDirection
 from cloudrc.wire.messages import NEVER_NS, plan_length

@@ -17,7 +17,7 @@ from cloudrc.config.profile import CLOUD_TIME_MAX, COMMAND_AGE_MS, DIRECTIONS
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import has_mujoco
 from cloudrc.flight.ages import DURATION_NS, simulate_ages
-from cloudrc.flight.assembly import build_plan
+from cloudrc.flight.assembly.plan import build_plan
 from cloudrc.link.doubts import describe_heavy_loss, describe_low_rate
 from cloudrc.link.model import HEADER_BYTES
 from cloudrc.teleop.wire import Plan

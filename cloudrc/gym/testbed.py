@@ -20,14 +20,16 @@ from gymnasium import spaces
 
 from cloudrc.base.outside.refusal import naming
 from cloudrc.base.outside.values import RESULT
+from cloudrc.base.requirements import SIM, require
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config.problems import problem_at
 from cloudrc.config.schema import Link
-from cloudrc.flight.assembly import assemble, build_links, flight_limit
-from cloudrc.flight.drivers.virtual import VirtualRun
-from cloudrc.flight.runs.experiment import load
-from cloudrc.flight.runs.requirements import SIM, require
+from cloudrc.flight.assembly.link import build_links
+from cloudrc.flight.assembly.plan import flight_limit
+from cloudrc.flight.experiment import load
+from cloudrc.flight.virtual.flight import assemble
+from cloudrc.flight.virtual.run import VirtualRun
 from cloudrc.results.record.columns import Recording, RecordStore
 from cloudrc.results.report.document import Run
 from cloudrc.results.report.write import assess

@@ -21,8 +21,8 @@ from cloudrc.base.errors import NothingFlownError
 from cloudrc.base.statistics import exact_interval, median_interval
 from cloudrc.config.compute import compute_times
 from cloudrc.config.problems import problem_at
-from cloudrc.flight.runs.experiment import load, robots_of
-from cloudrc.flight.runs.flight import ERROR
+from cloudrc.flight.experiment import load, robots_of
+from cloudrc.flight.in_memory import ERROR
 from cloudrc.flight.trials.fingerprint import experiment_facts, fingerprint
 from cloudrc.flight.trials.fleet import alone, plan_fleet
 from cloudrc.flight.trials.plan import PlannedFlight

@@ -14,7 +14,7 @@ from cloudrc.base.outside.refusal import check_names, naming
 from cloudrc.base.outside.values import InvalidValueError
 from cloudrc.config.problems import problem_at
 from cloudrc.config.sweep import draft_of
-from cloudrc.flight.runs.flight import counts
+from cloudrc.flight.in_memory import counts
 from cloudrc.flight.trials.plan import SweepPlan, check
 from cloudrc.flight.trials.play import run
 from cloudrc.flight.trials.rows import Row, Rows

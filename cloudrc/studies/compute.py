@@ -13,11 +13,12 @@ import numpy as np
 from cloudrc.base.errors import NothingFlownError
 from cloudrc.base.outside.code import apart
 from cloudrc.cloud.compute_time import ComputeTime
-from cloudrc.flight import assembly
-from cloudrc.flight.drivers.cpu_limit import PacedClock, cpu_limit
-from cloudrc.flight.runs.experiment import load
-from cloudrc.flight.runs.interrupts import raise_if_interrupted
+from cloudrc.flight.assembly.link import build_links
+from cloudrc.flight.experiment import load
+from cloudrc.flight.interrupts import raise_if_interrupted
+from cloudrc.flight.virtual.flight import assemble
 from cloudrc.results.report.folder import read_run
+from cloudrc.studies.cpu_limit import PacedClock, cpu_limit
 from cloudrc.wire.messages import plan_length
 from cloudrc.wire.tunnel.codec import COMMAND_SIZES, Kind
 
@@ -58,7 +59,7 @@ def of_controller(
     experiment = load("steps", [f"cloud.controller={controller}", *settings])
     clock = PacedClock()
     kept = _Kept(clock)
-    *_, teleop, run = assembly.assemble(experiment, compute=kept)
+    *_, teleop, run = assemble(experiment, compute=kept)
     clock.virtual_ns = lambda: run.now_ns
     with nullcontext("") if cpus is None else cpu_limit(cpus) as unlimited:
         run.fly(lambda: teleop.over, round(seconds * 1e9), lambda *_: raise_if_interrupted())
@@ -74,7 +75,7 @@ def of_run(folder: Path) -> MeasuredTimes:
     if len(rows):
         busy = rows["busy"][rows["end"] == "cloud"]
         return MeasuredTimes((busy * 1e3).tolist(), f"periods of cloud's loop in {folder}")
-    link, arrived = assembly.build_links(experiment)[1], recording["/downlink_delay"]
+    link, arrived = build_links(experiment)[1], recording["/downlink_delay"]
     if not experiment.cloud.compute_measured or link.only is None or experiment.is_fleet:
         text = "needs a flight in real time, or one with cloud.compute_measured and a link without"
         raise NothingFlownError(f"{folder}: {text} a rate, keep_order and a schedule")

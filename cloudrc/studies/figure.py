@@ -11,7 +11,7 @@ from typing import Any
 
 from cloudrc.base.outside.refusal import check_names
 from cloudrc.base.statistics import exact_interval, median_interval
-from cloudrc.flight.runs.flight import counts
+from cloudrc.flight.in_memory import counts
 from cloudrc.flight.trials.rows import Row
 from cloudrc.flight.trials.summary import RATIO, count_successes, default_numbers, values_of
 from cloudrc.results.metrics.measure import SHIPPED, scale

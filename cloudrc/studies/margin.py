@@ -16,9 +16,9 @@ from cloudrc.config.overrides import onboard_values
 from cloudrc.config.problems import problem_at
 from cloudrc.config.profile import COMMAND_AGE_MS
 from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.flight import in_memory as flight
 from cloudrc.flight.ages import simulate_ages
-from cloudrc.flight.runs import flight
-from cloudrc.flight.runs.experiment import check_no_seed, load
+from cloudrc.flight.experiment import check_no_seed, load
 from cloudrc.flight.trials.workers import map_in_order
 from cloudrc.studies import stability
 from cloudrc.studies.search import ValueRange, bisect, search

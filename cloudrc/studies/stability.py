@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from cloudrc.base.outside import code
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
-from cloudrc.flight import assembly
 from cloudrc.flight.ages import simulate_ages
-from cloudrc.flight.runs.flight import explain
+from cloudrc.flight.in_memory import explain
+from cloudrc.flight.virtual.flight import fly_virtual
 from cloudrc.physics.geometry.scene import load_scene
 from cloudrc.results.metrics.counters import growth
 from cloudrc.results.metrics.verdict import NOT_STARTED, plugin_failures
@@ -128,7 +128,7 @@ def fly(experiment: ResolvedExperiment, start: Array, end: Array, window: float)
     def see(world: list[Record], cloud: list[Record]) -> None:
         store.add(*([one for one in each if isinstance(one, KEPT)] for each in (world, cloud)))
 
-    assembly.fly(_with_step(experiment, start, end, window), see)
+    fly_virtual(_with_step(experiment, start, end, window), see)
     return _track(Recording(records=store))
 
 

@@ -29,8 +29,8 @@ from cloudrc.base.files import read_json, write_atomically, write_json
 from cloudrc.base.outside.document import read_document, write_yaml
 from cloudrc.base.outside.paths import LOCK, lock_folder
 from cloudrc.base.text import table
-from cloudrc.flight.runs.fly import fly
-from cloudrc.flight.runs.folder import new_folder
+from cloudrc.flight.fly import fly
+from cloudrc.flight.folder import new_folder
 from cloudrc.flight.trials import tables
 from cloudrc.flight.trials.plan import COLUMNS, PlannedFlight, SweepPlan, read_plan
 from cloudrc.flight.trials.rows import SIZE_MAX, Row, Rows, read_rows

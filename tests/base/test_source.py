@@ -107,7 +107,7 @@ def test_every_part_that_does_not_count_exists_and_no_wing_below_the_guests_is_o
 ROWS = {
     "sweep": (
         "from cloudrc.config.load import load_experiment\n"
-        "from cloudrc.flight.runs.flight import fly_point\n"
+        "from cloudrc.flight.in_memory import fly_point\n"
         "row = fly_point(load_experiment('steps', ['mission.steps.count=1']))\n"
         "assert row['verdict'] == 'success', row"
     ),

@@ -13,7 +13,7 @@ import pytest
 
 from cloudrc.cloud.compute_time import ComputeTime
 from cloudrc.config.load import load_experiment
-from cloudrc.flight.assembly import assemble
+from cloudrc.flight.virtual.flight import assemble
 from cloudrc.wire.records import Arrival, Control, Fault
 from tests.flights.conftest import fly_on
 

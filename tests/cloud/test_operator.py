@@ -6,7 +6,7 @@ import pytest
 
 from cloudrc.cloud.operator import REPEAT_NS, EmergencyStopRepeater
 from cloudrc.config.load import load_experiment
-from cloudrc.flight import assembly
+from cloudrc.flight.virtual.flight import assemble
 from cloudrc.wire.messages import GuardState, OperatorRequest, Request
 
 ESTOP, TRACK = GuardState.ESTOP, GuardState.TRACK
@@ -41,7 +41,7 @@ def test_an_alarm_stays_above_all_other_requests():
 
 def test_round_trip_and_uplink_of_a_status_give_the_downlink():
     ways = ["link.profile=ideal", "link.uplink.delay_ms=30", "link.downlink.delay_ms=10"]
-    _, cloud, _, flight = assembly.assemble(load_experiment("hover", ways))
+    _, cloud, _, flight = assemble(load_experiment("hover", ways))
     statuses, see = [], cloud.teleop.see
     cloud.teleop.see = lambda status, now_ns: (statuses.append(status), see(status, now_ns))
     flight.fly(lambda: len(statuses) > 200, 10**10, lambda of_world, of_cloud: None)

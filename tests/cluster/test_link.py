@@ -16,7 +16,7 @@ import yaml
 from cloudrc.base.errors import BadInputError
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.link import CARRIER, with_files
-from cloudrc.flight.drivers.link_control import ControlServer
+from cloudrc.flight.pod.link_control import ControlServer
 from cloudrc.link.control import put_request, read_answer
 from cloudrc.link.state import LinkState
 

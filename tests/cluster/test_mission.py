@@ -9,7 +9,7 @@ import pytest
 
 from cloudrc.cluster import flight
 from cloudrc.doors.cli.main import main
-from cloudrc.flight.runs.missions import read_mission
+from cloudrc.doors.missions import read_mission
 from cloudrc.results import under_way
 from tests.cluster.conftest import TOKEN, missions_of, pod, terminated
 

@@ -7,8 +7,8 @@ import pytest
 from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment, load_link
 from cloudrc.config.resolved import dump, fingerprint
-from cloudrc.flight.runs.experiment import check_mode
-from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.flight.experiment import check_mode
+from cloudrc.flight.in_memory import fly_in_memory
 from cloudrc.wire.messages import GuardState
 from tests.config.conftest import refused_line
 

@@ -9,7 +9,7 @@ import pytest
 
 import cloudrc
 from cloudrc.config.load import load_experiment
-from cloudrc.flight.assembly import build_plan
+from cloudrc.flight.assembly.plan import build_plan
 from cloudrc.teleop.models import RefusedError, RequestReader
 from tests.config.conftest import refused, refused_line
 

@@ -8,7 +8,7 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
-from cloudrc.flight.assembly import build_plan
+from cloudrc.flight.assembly.plan import build_plan
 from tests.config.conftest import refused_line
 
 

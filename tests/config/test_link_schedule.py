@@ -11,7 +11,7 @@ from cloudrc.config.link_edit import edit_profile
 from cloudrc.config.link_schedule import describe_one_schedule, find_ways, link_start
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import dump, fingerprint
-from cloudrc.flight.assembly import build_links
+from cloudrc.flight.assembly.link import build_links
 from tests.config.conftest import refused_line
 
 HANDOVER = "link.profile=handover"

@@ -20,8 +20,8 @@ from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import METRICS, fetch_recording, forwarded
 from cloudrc.config.load import load_experiment
-from cloudrc.flight.runs.links.verify import fetch
-from tests.flight.drivers.conftest import WORK, slower
+from cloudrc.flight.links.verify import fetch
+from tests.flight.conftest import WORK, slower
 from tests.support.commands import python
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -30,7 +30,7 @@ from tests.e2e.conftest import (
     until_ready,
     value,
 )
-from tests.flight.drivers.conftest import ages_at_hold
+from tests.flight.conftest import ages_at_hold
 
 pytestmark = pytest.mark.real_time
 

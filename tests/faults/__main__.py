@@ -23,7 +23,7 @@ from typing import Any
 from cloudrc.base.text import table
 from cloudrc.config import shipped
 from cloudrc.config.schema import World
-from cloudrc.flight.runs.interrupts import interrupt_on_signals
+from cloudrc.flight.interrupts import interrupt_on_signals
 from tests.faults.search import fly_seed, search, search_rows, search_summary, store
 from tests.faults.trial import TrialResult
 

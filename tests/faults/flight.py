@@ -20,9 +20,12 @@ from cloudrc.config import shipped
 from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import World
-from cloudrc.flight import assembly
-from cloudrc.flight.drivers.teleop import PERIOD_NS as WAKE_NS
-from cloudrc.flight.drivers.virtual import Clock, VirtualRun
+from cloudrc.flight.assembly.cloud import build_cloud
+from cloudrc.flight.assembly.plan import build_plan
+from cloudrc.flight.assembly.world import build_world
+from cloudrc.flight.pod.teleop_link import PERIOD_NS as WAKE_NS
+from cloudrc.flight.virtual.flight import CLOUD_CLOCK, VIRTUAL_CLOCK
+from cloudrc.flight.virtual.run import Clock, VirtualRun
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.results.record.columns import Recording
@@ -76,7 +79,7 @@ class FaultRun:
         offset = schedule.cloud_offset % OFFSET_MAX  # no clock shows a negative time
         self._clock = Clock(round(offset * 1e9), schedule.cloud_drift)
         is_shared = self._clock == Clock()
-        self._clock_id = assembly.VIRTUAL_CLOCK if is_shared else assembly.CLOUD_CLOCK
+        self._clock_id = VIRTUAL_CLOCK if is_shared else CLOUD_CLOCK
         self._fence = self.experiment.world.files.fence
         policy, self._words = dishonesty(schedule, self._fence)
         mistakes = [bugs(schedule, self._clock)] if schedule.of(*BUGS) else []
@@ -126,7 +129,7 @@ class FaultRun:
 
     def make_order(self) -> Order:
         """Make the order with which teleop flies the experiment's mission."""
-        plan = assembly.build_plan(self.experiment)
+        plan = build_plan(self.experiment)
         return Order(plan, touch=self.experiment.mission.touch)
 
     def fly(self, until: float, look: Callable[[], bool | None] = lambda: False) -> FaultRun:
@@ -197,8 +200,8 @@ class FaultRun:
         return self.robot.guard.state, self.robot.guard.cause.words
 
     def _build_world(self, start_ns: int) -> Endpoint:
-        identity = self._begin("world", assembly.VIRTUAL_CLOCK)
-        world = assembly.build_world(self.experiment, identity, lambda: start_ns)
+        identity = self._begin("world", VIRTUAL_CLOCK)
+        world = build_world(self.experiment, identity, lambda: start_ns)
         self._observers.append(RobotObserver(world.robot, self._rules, start_ns))
         return world
 
@@ -208,7 +211,7 @@ class FaultRun:
         if self._words is not None:
             teleop = HostileOperator(teleop, self._words)
         make_loop = partial(DishonestLoop, self._lies) if self._lies else ControlLoop
-        cloud = assembly.build_cloud(
+        cloud = build_cloud(
             self.experiment, identity, teleop, lambda: start_ns, make_loop=make_loop
         )
         if self._rival_at is None:
@@ -220,8 +223,8 @@ class FaultRun:
         """Build a second cloud with the same key; it has its own teleop and the same mission."""
         teleop = Teleop(self._fence)
         teleop.start(start_ns, MissionRecord("rival", self.make_order(), 0))
-        identity = Identity(assembly.VIRTUAL_CLOCK, b"rival".ljust(16), KeyRing(SECRET))
-        return assembly.build_cloud(self.experiment, identity, teleop, lambda: start_ns)
+        identity = Identity(VIRTUAL_CLOCK, b"rival".ljust(16), KeyRing(SECRET))
+        return build_cloud(self.experiment, identity, teleop, lambda: start_ns)
 
     def _begin(self, end: str, clock_id: bytes) -> Identity:
         """Make key ring and identity of a new process of `end`, "world" or "cloud"."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cloudrc.flight.drivers.virtual import Clock
+from cloudrc.flight.virtual.run import Clock
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
 from cloudrc.teleop.service import MissionService
 from cloudrc.wire.messages import Command

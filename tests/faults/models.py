@@ -9,9 +9,9 @@ from contextlib import suppress
 from functools import partial
 from typing import TypeAlias
 
-from cloudrc.flight.drivers.faults import RestartableEndpoint
-from cloudrc.flight.drivers.teleop import PERIOD_NS, RemoteTeleop, TeleopLoop, UnixPeer
-from cloudrc.flight.drivers.virtual import Clock
+from cloudrc.flight.pod.teleop_link import PERIOD_NS, RemoteTeleop, TeleopLoop, UnixPeer
+from cloudrc.flight.virtual.faults import RestartableEndpoint
+from cloudrc.flight.virtual.run import Clock
 from cloudrc.physics.geometry.fence import Fence
 from cloudrc.teleop.refusals import ConflictError, UnavailableError
 from cloudrc.teleop.service import MissionService

@@ -7,8 +7,10 @@ from functools import lru_cache
 from types import SimpleNamespace
 
 from cloudrc.config.load import load_experiment
-from cloudrc.flight import assembly
-from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.flight.assembly.plan import flight_limit
+from cloudrc.flight.assembly.world import build_world
+from cloudrc.flight.in_memory import fly_in_memory
+from cloudrc.flight.virtual.flight import assemble, fly_virtual
 from cloudrc.results.record.columns import Recording, RecordStore
 from cloudrc.wire.messages import (
     UPRIGHT,
@@ -141,7 +143,7 @@ class Bare:
     def __init__(self, keys, *, flies=False):
         """Start world, with a simulated robot if it `flies`."""
         identity = Identity(CLOCK, b"world".ljust(16), keys)
-        self.world = assembly.build_world(HOVER, identity) if flies else bare_world(keys)
+        self.world = build_world(HOVER, identity) if flies else bare_world(keys)
         self.keys, self.now_ns, self.born = keys, 0, 0
         self.clouds = {}
         self.sent = []  # everything that any cloud has ever sent
@@ -229,8 +231,8 @@ def fly_on(run, until_ns, over=lambda: False):
 
 def records(experiment):
     """Fly and return the records of world and of cloud."""
-    _, _, teleop, run = assembly.assemble(experiment)
-    limit_ns = round(assembly.flight_limit(experiment) * 1e9)
+    _, _, teleop, run = assemble(experiment)
+    limit_ns = round(flight_limit(experiment) * 1e9)
     return fly_on(run, limit_ns, lambda: teleop.over)
 
 
@@ -243,7 +245,7 @@ def fly(name, *settings):
 def sha256(experiment):
     """Fly and return the hash of all records, which is that of a report, too."""
     store = RecordStore()
-    assembly.fly(experiment, store.add)
+    fly_virtual(experiment, store.add)
     return Recording(records=store).sha256
 
 

@@ -15,10 +15,12 @@ import pytest
 from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import dump
-from cloudrc.flight import assembly
-from cloudrc.flight.assembly import build_cloud, build_links, build_world, start_mission
-from cloudrc.flight.drivers.virtual import VirtualRun
-from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.flight.assembly.cloud import build_cloud
+from cloudrc.flight.assembly.link import build_links
+from cloudrc.flight.assembly.world import build_world
+from cloudrc.flight.in_memory import fly_in_memory
+from cloudrc.flight.virtual.flight import fly_virtual, start_mission
+from cloudrc.flight.virtual.run import VirtualRun
 from cloudrc.results.metrics.age import describe, sawtooth
 from cloudrc.results.record.columns import Recording, RecordStore
 from cloudrc.results.record.writer import McapWriter
@@ -185,7 +187,7 @@ def test_the_rest_of_a_flight_keeps_every_bit():
     plain = load_experiment("hover", [*FILM[:2], BRIEF])
     assert "camera" not in plain.model_dump(mode="json")
     store = RecordStore()
-    assembly.fly(plain, store.add)
+    fly_virtual(plain, store.add)
     without, filmed = Recording(records=store), fly(BRIEF)
     assert not any(len(without[name]) for name in ("/frame", "/frame_shown", "/camera"))
     for topic in ("/ground_truth", "/cmd_vel", "/uplink_delay"):
@@ -203,7 +205,7 @@ def test_a_loss_costs_h264_all_pictures_up_to_the_next_key_frame():
 
 @pytest.mark.parametrize("queue", ["fifo", "priority", "newest"])
 def test_a_cell_with_priority_sends_telemetry_before_pictures(queue):
-    from cloudrc.flight.runs.fleet import assemble_fleet
+    from cloudrc.flight.fleet import assemble_fleet
 
     cell = ("cell.rate_kbit=900", f"cell.queue={queue}")
     settings = (*cell, "link.profile=ideal", "camera.quality=95")
@@ -337,7 +339,7 @@ def test_a_recording_gives_back_the_pictures(tmp_path):
             store.add(*records)
             writer.write([*records[0], *records[1]])
 
-        assembly.fly(experiment, see)
+        fly_virtual(experiment, see)
     made, read = Recording(records=store), Recording.read(tmp_path / "a.mcap")
     assert read.sha256 == made.sha256
     assert read["/camera"]["data"][-1] == made["/camera"]["data"][-1]
@@ -346,7 +348,7 @@ def test_a_recording_gives_back_the_pictures(tmp_path):
 def test_a_flight_without_a_camera_loads_no_renderer_and_no_codec():
     program = (
         "import sys; from cloudrc.config.load import load_experiment as load;"
-        "from cloudrc.flight.runs.flight import fly_in_memory as fly;"
+        "from cloudrc.flight.in_memory import fly_in_memory as fly;"
         f"fly(load('hover', ['world.robot=x2', 'world.scene=empty', '{BRIEF}']));"
         "print({'cloudrc.physics.sim.camera', 'av', 'OpenGL', 'mujoco.egl'} & sys.modules.keys())"
     )

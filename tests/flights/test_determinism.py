@@ -12,8 +12,11 @@ from pathlib import Path
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.flight.assembly import assemble, build_cloud, build_links, build_world, start_mission
-from cloudrc.flight.drivers.virtual import VirtualRun
+from cloudrc.flight.assembly.cloud import build_cloud
+from cloudrc.flight.assembly.link import build_links
+from cloudrc.flight.assembly.world import build_world
+from cloudrc.flight.virtual.flight import assemble, start_mission
+from cloudrc.flight.virtual.run import VirtualRun
 from cloudrc.results.record.columns import Recording, RecordStore
 from cloudrc.wire.tunnel.codec import DecodeError
 from cloudrc.wire.tunnel.end import Identity
@@ -104,12 +107,15 @@ WALL = re.compile(
     r"|from time import|\bdate(time)?\.(now|utcnow|today)\b"
 )
 """What reads a wall clock."""
-CONTROL_PATH = ("world/", "cloud/", "teleop/", "wire/", "link/", "flight/drivers/")
+CONTROL_PATH = (
+    *("world/", "cloud/", "teleop/", "wire/", "link/"),
+    *("flight/assembly/", "flight/local/", "flight/pod/", "flight/virtual/"),
+)
 ALLOWED = {
     # The kernel stamps datagrams and probes by this clock; only ages of 0 to 50 ms are used.
     *("link/carry/udp.py", "link/verify/probe.py"),
     # Only people read these times.
-    *("flight/drivers/process.py", "link/follow.py"),
+    *("flight/pod/ends.py", "flight/pod/process.py", "link/follow.py"),
 }
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from cloudrc.config.faults import FaultConfig
 from cloudrc.config.load import load_experiment
-from cloudrc.flight.drivers.faults import faulty_clock
-from cloudrc.flight.drivers.virtual import Clock
-from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.flight.in_memory import fly_in_memory
+from cloudrc.flight.virtual.faults import faulty_clock
+from cloudrc.flight.virtual.run import Clock
 from cloudrc.wire.messages import GuardState
 
 pytestmark = pytest.mark.usefixtures("shared_files")

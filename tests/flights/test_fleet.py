@@ -7,9 +7,9 @@ import pytest
 
 from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
-from cloudrc.flight.processes.ends import EndSettings, open_end
-from cloudrc.flight.runs.experiment import check_mode, robots_of
-from cloudrc.flight.runs.fleet import assemble_fleet
+from cloudrc.flight.experiment import check_mode, robots_of
+from cloudrc.flight.fleet import assemble_fleet
+from cloudrc.flight.pod.ends import EndSettings, open_end
 from cloudrc.results.record.columns import Recording, RecordStore, datagrams
 from tests.config.conftest import refused
 from tests.conftest import nightly_rows

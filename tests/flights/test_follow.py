@@ -9,8 +9,8 @@ import pytest
 
 from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
-from cloudrc.flight.assembly import build_plan, with_order
-from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.flight.assembly.plan import build_plan, with_order
+from cloudrc.flight.in_memory import fly_in_memory
 from cloudrc.teleop.models import RequestReader
 from tests.support.camera import needs_renderer
 

@@ -7,7 +7,8 @@ import sys
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.flight.in_memory import fly_in_memory
 from cloudrc.results.report.write import assess
 
 TRACK = "time_s,x_m,y_m,z_m\n0,0,0,1\n1.5,0,0,1\n2.5,1.5,0,1\n4,1.5,0,1\n"
@@ -69,7 +70,8 @@ def test_the_report_has_the_clearance_from_any_obstacle(flown_into):
 def test_a_report_needs_no_mujoco(flown_into, monkeypatch):
     found = flown_into(f'<body name="post" pos="3 0 0">{GEOM}</body>')
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    notes = assess(found.flight.recording, found.experiment, found.run).notes
+    experiment = ResolvedExperiment.model_validate_json(found.experiment.model_dump_json())
+    notes = assess(found.flight.recording, experiment, found.run).notes
     (note,) = [note for note in notes if note.startswith("No clearance is known from")]
     assert note.endswith("all bodies but declared tubes: MuJoCo is not installed.")
 

@@ -7,7 +7,8 @@ from types import SimpleNamespace
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.flight import assembly
+from cloudrc.flight.assembly.link import build_links
+from cloudrc.flight.virtual.flight import assemble
 from cloudrc.teleop.wire import ALARM
 from cloudrc.wire.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.wire.records import UNDER_WAY, Counted, GuardChange, MissionEvent
@@ -21,7 +22,7 @@ ESTOP = GuardState.ESTOP
 
 def join(experiment=HOVER):
     """Assemble both ends and their flight."""
-    _, cloud, _, run = assembly.assemble(experiment)
+    _, cloud, _, run = assemble(experiment)
     return SimpleNamespace(cloud=cloud, run=run)
 
 
@@ -76,7 +77,7 @@ def test_a_link_that_loses_most_loses_no_alarm(seed):
     ends = join(load_experiment("hover", ["link.profile=ideal", f"seed={seed}"]))
     fly_on(ends.run, 4 * S)
     lossy = ["link.profile=ideal", *both_ways(loss=0.8), f"seed={seed}"]
-    ends.run._uplink, ends.run._downlink = assembly.build_links(load_experiment("hover", lossy))
+    ends.run._uplink, ends.run._downlink = build_links(load_experiment("hover", lossy))
     ends.cloud.teleop.outputs.append(ALARM)
     assert states(ends, 4)[-1] is ESTOP
 

@@ -6,7 +6,7 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import MissionConfig
-from cloudrc.flight import assembly
+from cloudrc.flight.assembly.plan import build_plan
 from tests.conftest import nightly
 from tests.flights.conftest import fly, numbers
 
@@ -53,7 +53,7 @@ def test_the_limit_of_a_leg_defaults_to_three_times_its_time():
     mission = MissionConfig.model_validate({"start": "here", "waypoints": tuple(points)})
     for speed, second in ((6, 33.0), (0.5, 48.0)):
         flown = load_experiment("hover", [f"guard.speed_max_mps={speed}"])
-        plan = assembly.build_plan(flown, mission)
+        plan = build_plan(flown, mission)
         limits = [leg.time_limit for leg in plan.legs]
         assert limits[1:] == [second, 7.5]
         assert plan.time_limit == max(60.0, sum(limits))
@@ -63,4 +63,4 @@ def test_a_long_mission_needs_no_time_limit_of_its_own():
     flight = fly("hover", "mission.waypoints.0.dwell_s=60", "criteria={settle_m: 0.15}")
     assert flight.verdict.failures == ()
     steps = load_experiment("steps", ["mission.steps.count=20"])
-    assert assembly.build_plan(steps).time_limit > 20 * 4.25
+    assert build_plan(steps).time_limit > 20 * 4.25

@@ -10,10 +10,12 @@ import pytest
 
 from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
-from cloudrc.flight import assembly
-from cloudrc.flight.assembly import build_cloud, build_links, build_world, start_mission
-from cloudrc.flight.drivers.virtual import VirtualRun
-from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.flight.assembly.cloud import build_cloud
+from cloudrc.flight.assembly.link import build_links
+from cloudrc.flight.assembly.world import build_world
+from cloudrc.flight.in_memory import fly_in_memory
+from cloudrc.flight.virtual.flight import fly_virtual, start_mission
+from cloudrc.flight.virtual.run import VirtualRun
 from cloudrc.physics.geometry.rays import ranges_of
 from cloudrc.results.record.columns import Recording, RecordStore
 from cloudrc.results.record.writer import McapWriter
@@ -30,7 +32,7 @@ LATE = ("link.both.delay_ms=300",)
 def fly(experiment):
     """Fly in virtual time; return the recording."""
     store = RecordStore()
-    assembly.fly(experiment, store.add)
+    fly_virtual(experiment, store.add)
     return Recording(records=store)
 
 

@@ -4,7 +4,7 @@
 
 import numpy as np
 
-from cloudrc.flight.runs.links.trace import one_way
+from cloudrc.flight.links.trace import one_way
 from cloudrc.link.trace_logs import trace_of
 from cloudrc.link.traces import write_trace
 from tests.flights.conftest import fly

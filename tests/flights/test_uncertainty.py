@@ -7,7 +7,7 @@ import json
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.flight.in_memory import fly_in_memory
 from tests.flights.conftest import numbers
 
 POINT = (0.5, 0.0, 0.9)

@@ -10,7 +10,7 @@ import pytest
 
 from cloudrc.base.errors import BadInputError
 from cloudrc.base.files import write_atomically
-from cloudrc.flight.processes.link import make_profile_loader
+from cloudrc.flight.pod.link import make_profile_loader
 from cloudrc.link.follow import PeerName, Profiles
 from cloudrc.link.state import ChangeFacts
 

@@ -17,8 +17,8 @@ import pytest
 from cloudrc.base.errors import MissingPrerequisiteError
 from cloudrc.config.profile import load_profile
 from cloudrc.config.shipped import names
-from cloudrc.flight.drivers.programs import Programs
-from cloudrc.flight.runs.links.under_test import DEVICE, HOSTS, _namespaces, inside
+from cloudrc.flight.links.under_test import DEVICE, HOSTS, _namespaces, inside
+from cloudrc.flight.pod.netem_tools import Programs
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.netem import STRETCH, Netem, table
 from cloudrc.link.profile import Trace

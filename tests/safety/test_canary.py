@@ -11,8 +11,8 @@ import pytest
 from mcap.exceptions import McapError
 from mcap.stream_reader import StreamReader
 
-from cloudrc.flight.drivers.realtime import free_ports
-from tests.flight.drivers.conftest import KEY, TOKEN, Release
+from cloudrc.flight.pod.realtime import free_ports
+from tests.flight.conftest import KEY, TOKEN, Release
 
 SECRET_FILES = ("operator", "key")
 CANARIES = [

@@ -13,9 +13,9 @@ from cloudrc.config.choice import PlugIn
 from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import dump
 from cloudrc.doors.cli.main import main
-from cloudrc.flight.drivers.machine import interpreter
-from cloudrc.flight.processes import ends
-from cloudrc.flight.runs.links.verify import find_experiment
+from cloudrc.flight.links.verify import find_experiment
+from cloudrc.flight.machine import interpreter
+from cloudrc.flight.pod import ends
 from cloudrc.flight.trials.workers import map_in_order
 from cloudrc.results.report.figures import FIGURES
 from tests.results.metrics.conftest import flown
@@ -108,11 +108,11 @@ def modules_with(text):
 
 def test_plug_ins_and_processes_begin_only_where_they_should():
     """All code that does not fly uses `read_experiment`, which imports no plug-in."""
-    flies = {f"flight/{name}.py" for name in ("runs/experiment", "processes/ends", "runs/bench")}
-    flies |= {"studies/reproduce/flights.py", "studies/exercise/checks.py"}
+    flies = {"flight/experiment.py", "flight/pod/ends.py"}
+    flies |= {f"studies/{name}.py" for name in ("bench", "exercise/checks", "reproduce/flights")}
     flies |= {"cluster/survey.py"}  # values with a plug-in by name; files are not looked at
     assert modules_with("load_experiment(") == flies | {"config/load.py"}
-    assert modules_with("sys.executable") == {"flight/drivers/machine.py"}
+    assert modules_with("sys.executable") == {"flight/machine.py"}
 
 
 def test_a_new_process_imports_nothing_from_the_working_folder(run, trace, spy, monkeypatch):

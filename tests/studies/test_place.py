@@ -8,7 +8,7 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.doors.cli.main import main
-from cloudrc.flight import assembly
+from cloudrc.flight.assembly.cloud import build_compute_time
 from cloudrc.studies.place import DISTURBANCES, PlaceStudy, judge
 from tests.doors.cli.conftest import SHORT
 
@@ -30,7 +30,7 @@ def place(name, succeeded=(1,) * 8, **numbers):
 @pytest.mark.parametrize("speed", [0.2, 1, 2])
 def test_a_computation_takes_the_time_of_the_reference_divided_by_the_speed(speed):
     experiment = load_experiment("steps", ["cloud.compute_ms=10", f"cloud.speed={speed}"])
-    assert assembly.build_compute_time(experiment).end(0) == round(10e6 / speed)
+    assert build_compute_time(experiment).end(0) == round(10e6 / speed)
 
 
 @pytest.mark.parametrize(

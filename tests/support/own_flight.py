@@ -7,7 +7,7 @@ import shutil
 from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
 from cloudrc.config.shipped import file_of
-from cloudrc.flight.runs.fly import fly
+from cloudrc.flight.fly import fly
 
 PREDICTOR = "from cloudrc.cloud.predictors.last_sample import build\n"
 GHOST = '<body name="ghost"><geom size=".1" contype="0" conaffinity="0"/></body>'

@@ -19,7 +19,7 @@ from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.cloud.operator import EmergencyStopRepeater
 from cloudrc.config.load import read_experiment
 from cloudrc.config.world import ResolvedWorld
-from cloudrc.flight.assembly import build_plan
+from cloudrc.flight.assembly.plan import build_plan
 from cloudrc.physics.geometry.scene import load_scene
 from cloudrc.teleop import store
 from cloudrc.teleop.api import STARTING, ApiServer, Bridge, create_app

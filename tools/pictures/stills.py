@@ -13,7 +13,7 @@ from PIL import Image
 import cloudrc
 from cloudrc.config import shipped
 from cloudrc.config.robot import find_robot
-from cloudrc.flight.runs.experiment import load
+from cloudrc.flight.experiment import load
 from tools.guests import DOCS, flight_of
 from tools.pictures.stage import BLUE, GOAL, Array, Stage, View, check_size
 

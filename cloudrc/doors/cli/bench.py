@@ -30,7 +30,7 @@ def arguments(parser: Parser) -> None:
 def execute(options: Options) -> None:
     """Run all measurements; print the processor time per physics step or per virtual time."""
     from cloudrc.doors.cli.progress import Progress
-    from cloudrc.flight.runs.bench import as_text, bench
+    from cloudrc.studies.bench import as_text, bench
 
     with Progress(f"measures each part {options.repeats} times"):
         document = bench(options.repeats)

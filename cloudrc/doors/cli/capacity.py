@@ -62,9 +62,9 @@ def arguments(parser: Parser) -> None:
 def execute(options: Options) -> None:
     """Find the capacity of each queue and controller; write and print it, and draw the figure."""
     from cloudrc.base.files import write_atomically, write_json
+    from cloudrc.base.requirements import MODES, require
     from cloudrc.doors.cli.progress import Progress
-    from cloudrc.flight.runs.folder import results_folder
-    from cloudrc.flight.runs.requirements import MODES, require
+    from cloudrc.flight.folder import results_folder
     from cloudrc.flight.trials.rows import Rows
     from cloudrc.results.report.figures.style import Look
     from cloudrc.studies.capacity import Sought, describe, fly

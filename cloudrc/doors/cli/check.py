@@ -55,7 +55,7 @@ def execute(options: Options) -> int:
     if options.kind or options.path.endswith(".py"):
         return _check_plugin(options)
     from cloudrc.doors.cli.progress import Progress
-    from cloudrc.flight.runs.robot_check import as_text, check_robot
+    from cloudrc.doors.robot_check import as_text, check_robot
 
     with Progress(f"flies {options.path}"):
         document, note = check_robot(options.path, options.picture)

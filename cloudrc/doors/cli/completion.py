@@ -30,8 +30,8 @@ def execute(options: Options) -> None:
     import shtab
 
     from cloudrc.config import shipped
+    from cloudrc.doors.catalogue import settings
     from cloudrc.doors.cli.parser import COMMANDS, build_parser
-    from cloudrc.flight.runs.catalogue import settings
 
     keys = list(settings())
     of_link = [key.removeprefix("link.") for key in keys if key.startswith("link.")]

@@ -102,8 +102,8 @@ def execute(options: Options) -> int:
 def _local(options: Options) -> ConsoleTarget:
     from cloudrc.doors.console.serve import ConsoleTarget
     from cloudrc.doors.console.steering import LinkControl
-    from cloudrc.flight.drivers.local import LINK_FOLDER
-    from cloudrc.flight.runs.links.change import read_states, set_here
+    from cloudrc.flight.links.change import read_states, set_here
+    from cloudrc.flight.local.places import LINK_FOLDER
     from cloudrc.results.under_way import under_way
 
     found = need_run_here(options.run)

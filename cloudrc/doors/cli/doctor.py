@@ -19,11 +19,11 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 from cloudrc.base.errors import CloudrcError, MissingPrerequisiteError
+from cloudrc.base.requirements import EXTRAS, MODES, PACKAGES, missing
 from cloudrc.base.text import table
 from cloudrc.doors.cli.output import output_argument, paint, print_result
 from cloudrc.doors.cli.parser import Options, Parser
-from cloudrc.flight.drivers.machine import interpreter, usable_cores
-from cloudrc.flight.runs.requirements import EXTRAS, MODES, PACKAGES, missing
+from cloudrc.flight.machine import interpreter, usable_cores
 from cloudrc.physics.sim.egl import load_egl
 
 FLYING, CLUSTER = ("local", "virtual"), ("cluster",)

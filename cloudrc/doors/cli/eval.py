@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.base.errors import CloudrcError
 from cloudrc.base.outside.paths import lock_folder
 from cloudrc.base.outside.refusal import naming
+from cloudrc.base.requirements import require
 from cloudrc.base.text import cells, csv_table, escape, latex_table
 from cloudrc.doors.cli.output import TABLES, again, output_argument, print_result, tell
 from cloudrc.doors.cli.parser import COUNT_MAX, Options, Parser, number, read_count, whole_number
-from cloudrc.flight.runs.folder import new_folder
-from cloudrc.flight.runs.requirements import require
+from cloudrc.flight.folder import new_folder
 
 if TYPE_CHECKING:
     from cloudrc.flight.trials.rows import Row

@@ -35,7 +35,7 @@ def arguments(parser: Parser) -> None:
 
 def execute(options: Options) -> None:
     """Run `key new` (make or rotate a key) or `key drop` (remove the previous key)."""
-    from cloudrc.flight.drivers.keyfile import drop_previous, make_or_rotate
+    from cloudrc.flight.pod.keyfile import drop_previous, make_or_rotate
 
     path = options.file
     if options.verb == "new":

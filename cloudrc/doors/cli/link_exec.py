@@ -72,9 +72,9 @@ def _warn_of_hidden_nodes(*commands: str) -> None:
 
 def execute(options: Options) -> int:
     """Run both programs, print the verdict on the link, and return the client's exit code."""
-    from cloudrc.flight.runs.links.programs import ExecSettings, run_programs
-    from cloudrc.flight.runs.links.programs_report import make_exec_report, write_report
-    from cloudrc.flight.runs.links.verify import OF_PROGRAMS, as_text
+    from cloudrc.flight.links.programs import ExecSettings, run_programs
+    from cloudrc.flight.links.programs_report import make_exec_report, write_report
+    from cloudrc.flight.links.verify import OF_PROGRAMS, as_text
 
     _warn_of_hidden_nodes(options.server, options.client)
     settings = settings_from(options, ExecSettings)

@@ -52,8 +52,8 @@ def arguments(parser: Parser) -> None:
 
 def execute(options: Options) -> None:
     """Read the delays from SOURCE, write a trace per direction, and print a summary of each."""
-    from cloudrc.flight.runs.links.rates import is_capacity, write_rate_profile
-    from cloudrc.flight.runs.links.trace import read_packets, write_trace_file
+    from cloudrc.flight.links.rates import is_capacity, write_rate_profile
+    from cloudrc.flight.links.trace import read_packets, write_trace_file
 
     source, output = options.source, options.output
     if is_capacity(source):

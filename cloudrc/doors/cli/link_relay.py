@@ -97,8 +97,8 @@ def link_arguments(parser: Parser) -> None:
 def execute(options: Options) -> None:
     """Relay until a signal; print what was measured."""
     if options.verb == "tcp":
-        from cloudrc.flight.processes.ports import warn_if_exposed
-        from cloudrc.flight.runs.links.streams import RelaySettings, relay_tcp
+        from cloudrc.flight.links.streams import RelaySettings, relay_tcp
+        from cloudrc.flight.pod.ports import warn_if_exposed
 
         if options.to == options.listen:
             text = "is the address of --listen, too; name the server's host and port"
@@ -108,7 +108,7 @@ def execute(options: Options) -> None:
         text = _as_text(report)
     else:
         from cloudrc.doors.bridges.ros2.topics import TopicSettings, relay_topic
-        from cloudrc.flight.runs.links.verify import OF_PROGRAMS, as_text
+        from cloudrc.flight.links.verify import OF_PROGRAMS, as_text
 
         report = relay_topic(settings_from(options, TopicSettings), tell)
         text = as_text(report, more=OF_PROGRAMS)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cloudrc.doors.cli.parser import Options, Parser, settings_from, whole_number
 from cloudrc.doors.cli.processes import process_arguments, read_address
-from cloudrc.flight.drivers.process import StopSignal
+from cloudrc.flight.pod.process import StopSignal
 
 EPILOG = ""
 
@@ -47,6 +47,6 @@ def arguments(parser: Parser) -> None:
 def execute(options: Options) -> None:
     """Shape one direction of the link until SIGTERM."""
     stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
-    from cloudrc.flight.processes.link import LinkSettings, run_link
+    from cloudrc.flight.pod.link import LinkSettings, run_link
 
     run_link(settings_from(options, LinkSettings), stop)

@@ -51,8 +51,8 @@ def arguments(parser: Parser) -> None:
 def execute(options: Options) -> None:
     """Change the link as the flags say, and print the new state of the link."""
     began, number = monotonic(), secrets.token_hex(4)
-    from cloudrc.flight.drivers.local import LINK_FOLDER
-    from cloudrc.flight.runs.links.change import set_here, states_table
+    from cloudrc.flight.links.change import set_here, states_table
+    from cloudrc.flight.local.places import LINK_FOLDER
 
     if (found := find_local_run(options, links=True)) is not None:
         where, asked = str(found.folder), (options.profile, options.settings)

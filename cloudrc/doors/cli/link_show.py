@@ -73,7 +73,7 @@ def execute(options: Options) -> None:
 
 def _drawn(options: Options, kind: str) -> tuple[str, str, bytes]:
     """Return title, statistics and picture of a profile."""
-    from cloudrc.flight.runs.links.sample import SampleSettings, sample_profile, statistics_table
+    from cloudrc.flight.links.sample import SampleSettings, sample_profile, statistics_table
     from cloudrc.results.report.figures.link import render_link
 
     settings = settings_from(options, SampleSettings)

@@ -13,7 +13,7 @@ from cloudrc.doors.cli.where import flown_release, release_arguments
 from cloudrc.link.verify import DEFAULT
 
 if TYPE_CHECKING:
-    from cloudrc.flight.runs.links.verify import Report
+    from cloudrc.flight.links.verify import Report
 
 EPILOG = """\
 examples:
@@ -63,7 +63,7 @@ def arguments(parser: Parser) -> None:
 def execute(options: Options) -> int:
     """Measure the link and print the verdict; return 0 if the link matches its profile, else 1."""
     from cloudrc.doors.cli.progress import Progress
-    from cloudrc.flight.runs.links.verify import as_text  # imports large packages
+    from cloudrc.flight.links.verify import as_text  # imports large packages
 
     with Progress("measures the link"):
         report = _verify(options)
@@ -74,7 +74,7 @@ def execute(options: Options) -> int:
 def _verify(options: Options) -> Report:
     if options.ends or options.mode == "cluster":
         return _verify_release(options)
-    from cloudrc.flight.runs.links.verify import verify
+    from cloudrc.flight.links.verify import verify
 
     return verify(
         options.target,

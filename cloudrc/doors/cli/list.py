@@ -4,10 +4,10 @@
 
 from __future__ import annotations
 
+from cloudrc.doors.catalogue import KINDS, as_text, describe_all
 from cloudrc.doors.cli.output import output_argument, paint, print_result, tell
 from cloudrc.doors.cli.parser import Options, Parser
 from cloudrc.doors.cli.where import cluster_arguments, release_from_flags
-from cloudrc.flight.runs.catalogue import KINDS, as_text, describe_all
 
 RELEASES = "releases"
 EPILOG = """\

@@ -18,11 +18,11 @@ from cloudrc.base.errors import (
     machine_error,
 )
 from cloudrc.base.files import at_place
+from cloudrc.base.requirements import name_extra
 from cloudrc.base.text import escape
 from cloudrc.doors.cli.output import STDOUT, TABLE, discard_output, open_streams, reserve_stdout
 from cloudrc.doors.cli.parser import build_parser
-from cloudrc.flight.runs.interrupts import interrupt_on_signals, is_interrupted
-from cloudrc.flight.runs.requirements import name_extra
+from cloudrc.flight.interrupts import interrupt_on_signals, is_interrupted
 
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 

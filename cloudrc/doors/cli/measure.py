@@ -11,7 +11,7 @@ from cloudrc.base.errors import BadInputError
 from cloudrc.base.outside.paths import check_new
 from cloudrc.doors.cli.output import print_line, tell
 from cloudrc.doors.cli.parser import Options, Parser, add_verbs, number, set_argument
-from cloudrc.flight.drivers.machine import usable_cores
+from cloudrc.flight.machine import usable_cores
 
 VERBS = {"compute": "measure how long a controller computes a command"}
 """Verb -> its line in the help."""

@@ -46,7 +46,7 @@ from cloudrc.doors.cli.where import (
     run_argument,
     timeout_argument,
 )
-from cloudrc.flight.runs.missions import Json, MissionFollower, read_mission
+from cloudrc.doors.missions import Json, MissionFollower, read_mission
 from cloudrc.teleop.client import (
     Api,
     UnreachableError,
@@ -279,7 +279,7 @@ def _report(options: Options, _: Api | None = None) -> int:
     from cloudrc.cluster.kept import fetch_mission
     from cloudrc.doors.cli import report
     from cloudrc.doors.cli.where import flown_release
-    from cloudrc.flight.runs.folder import new_folder
+    from cloudrc.flight.folder import new_folder
 
     options.release = options.where or options.release
     release = flown_release(options)

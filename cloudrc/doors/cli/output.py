@@ -201,7 +201,7 @@ def warn_about(plan: SweepPlan) -> None:
 
 def warn(*experiments: ResolvedExperiment, seeds: int = 1) -> None:
     """Print warnings about experiments that fly with so many seeds on stderr."""
-    from cloudrc.flight.runs.experiment import advice_on
+    from cloudrc.flight.experiment import advice_on
 
     print_lines((f"cloudrc: warning: {text}" for text in advice_on(*experiments)), sys.stderr)
     warn_of_few_seeds(seeds, *experiments)

@@ -18,7 +18,7 @@ from cloudrc.doors.cli.parser import (
     set_argument,
     settings_from,
 )
-from cloudrc.flight.runs.folder import results_folder
+from cloudrc.flight.folder import results_folder
 
 EPILOG = """\
 examples:

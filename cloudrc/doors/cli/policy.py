@@ -11,8 +11,8 @@ from pathlib import Path
 from cloudrc.doors.cli.output import print_line, tell
 from cloudrc.doors.cli.parser import Options, Parser, add_verbs, whole_number
 from cloudrc.doors.cli.processes import number_argument
-from cloudrc.flight.drivers.openpi import KEY_VARIABLE
-from cloudrc.flight.drivers.process import StopSignal
+from cloudrc.flight.pod.openpi import KEY_VARIABLE
+from cloudrc.flight.pod.process import StopSignal
 
 VERBS = {
     "serve": "serve a Python policy over openpi's wire, until Ctrl-C",
@@ -57,7 +57,7 @@ def execute(options: Options) -> None:
         _serve(options)
         return
     stop = StopSignal()
-    from cloudrc.flight.processes.ends import run_remote
+    from cloudrc.flight.pod.ends import run_remote
 
     run_remote(options.config, options.socket, stop, watched=options.feed, robot=options.robot)
 
@@ -66,8 +66,8 @@ def _serve(options: Options) -> None:
     import asyncio
 
     from cloudrc.base.outside.code import apart
-    from cloudrc.flight.drivers.realtime import show_address
-    from cloudrc.flight.processes.ports import warn_if_exposed
+    from cloudrc.flight.pod.ports import warn_if_exposed
+    from cloudrc.flight.pod.realtime import show_address
     from cloudrc.studies.policy.serve import PolicyServer
 
     host, stdout = options.host, sys.stdout

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cloudrc.doors.cli.parser import Options, Parser, read_size, settings_from, whole_number
 from cloudrc.doors.cli.processes import read_address, status_arguments
-from cloudrc.flight.drivers.process import StopSignal
+from cloudrc.flight.pod.process import StopSignal
 
 EPILOG = """\
 Robot k's world sends to the port of --uplink + k, its cloud to the port of
@@ -40,6 +40,6 @@ def arguments(parser: Parser) -> None:
 def execute(options: Options) -> None:
     """Carry packets until SIGTERM."""
     stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
-    from cloudrc.flight.processes.cell import CellSettings, run_cell
+    from cloudrc.flight.pod.cell import CellSettings, run_cell
 
     run_cell(settings_from(options, CellSettings), stop)

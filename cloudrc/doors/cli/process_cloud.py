@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cloudrc.doors.cli.parser import Options, Parser, settings_from
 from cloudrc.doors.cli.processes import end_arguments
-from cloudrc.flight.drivers.process import StopSignal
+from cloudrc.flight.pod.process import StopSignal
 
 EPILOG = None
 
@@ -25,6 +25,6 @@ def arguments(parser: Parser) -> None:
 def execute(options: Options) -> None:
     """Control the robot until a signal stops the process."""
     stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
-    from cloudrc.flight.processes.ends import EndSettings, run_cloud
+    from cloudrc.flight.pod.ends import EndSettings, run_cloud
 
     run_cloud(settings_from(options, EndSettings), options.teleop, options.records, stop)

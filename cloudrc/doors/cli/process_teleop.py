@@ -7,11 +7,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from cloudrc.base.errors import BadInputError
+from cloudrc.base.requirements import require
 from cloudrc.doors.cli.parser import Options, Parser, settings_from
 from cloudrc.doors.cli.processes import process_arguments, read_address
-from cloudrc.flight.drivers.process import StopSignal
-from cloudrc.flight.drivers.realtime import Address
-from cloudrc.flight.runs.requirements import require
+from cloudrc.flight.pod.process import StopSignal
+from cloudrc.flight.pod.realtime import Address
 
 EPILOG = """\
 teleop talks to 'cloudrc process cloud --teleop DIR' through two sockets in DIR.
@@ -67,6 +67,6 @@ def execute(options: Options) -> None:
         )
     require("the API of teleop", ("api",))
     stop = StopSignal()
-    from cloudrc.flight.processes.teleop import TeleopSettings, run_teleop
+    from cloudrc.flight.pod.teleop import TeleopSettings, run_teleop
 
     run_teleop(settings_from(options, TeleopSettings), stop)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from cloudrc.doors.cli.parser import Options, Parser, settings_from
 from cloudrc.doors.cli.processes import end_arguments
-from cloudrc.flight.drivers.process import StopSignal
+from cloudrc.flight.pod.process import StopSignal
 
 EPILOG = None
 
@@ -19,6 +19,6 @@ def arguments(parser: Parser) -> None:
 def execute(options: Options) -> None:
     """Simulate the robot until a signal stops the process."""
     stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
-    from cloudrc.flight.processes.ends import EndSettings, run_world
+    from cloudrc.flight.pod.ends import EndSettings, run_world
 
     run_world(settings_from(options, EndSettings), stop)

@@ -14,7 +14,7 @@ from cloudrc.doors.cli.parser import (
     read_size,
     whole_number,
 )
-from cloudrc.flight.drivers.realtime import Address, split_address
+from cloudrc.flight.pod.realtime import Address, split_address
 
 
 def process_arguments(parser: Parser) -> None:

@@ -24,7 +24,7 @@ from rich.text import Text
 
 from cloudrc.base.text import escape
 from cloudrc.doors.cli.output import is_live, print_or_drop
-from cloudrc.flight.drivers.process import in_words
+from cloudrc.flight.pod.process import in_words
 from cloudrc.wire.messages import NEVER_NS, GuardState, Vector
 from cloudrc.wire.records import (
     Control,

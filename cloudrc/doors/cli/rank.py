@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.base.errors import BadInputError
 from cloudrc.base.outside.paths import lock_folder
 from cloudrc.base.outside.refusal import check_names
+from cloudrc.base.requirements import require
 from cloudrc.base.text import escape, table
 from cloudrc.doors.cli.output import tell
 from cloudrc.doors.cli.parser import COUNT_MAX, Options, Parser, read_count
 from cloudrc.doors.cli.sweep import shard
-from cloudrc.flight.runs.folder import RUNS
-from cloudrc.flight.runs.requirements import require
+from cloudrc.flight.folder import RUNS
 
 if TYPE_CHECKING:
     from cloudrc.studies.rank.tasks import Entrant

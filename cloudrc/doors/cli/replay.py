@@ -29,7 +29,7 @@ def execute(options: Options) -> None:
     if options.out is not None:
         check_new(options.out, "name another file with --out")
     from cloudrc.doors.cli.progress import Progress
-    from cloudrc.flight.runs.replay import write_replay
+    from cloudrc.doors.replay import write_replay
 
     with Progress(f"reads the recording of {options.run}"):
         out = write_replay(options.run, options.out)

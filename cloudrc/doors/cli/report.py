@@ -117,8 +117,8 @@ def _write(
     run: Path, metrics: Sequence[str], *, is_fleet: bool, figures: bool, look: Look
 ) -> dict[str, Any]:
     from cloudrc.doors.cli.progress import Progress
-    from cloudrc.flight.runs.fleet import write_again
-    from cloudrc.flight.runs.session import restore_mission
+    from cloudrc.flight.fleet import write_again
+    from cloudrc.flight.session import restore_mission
     from cloudrc.results.metrics import measure
     from cloudrc.results.record.topics import TOPICS
     from cloudrc.results.report.folder import check_ended, read_run

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.base.errors import BadInputError
+from cloudrc.base.requirements import MODES, require
 from cloudrc.base.text import escape
 from cloudrc.doors.cli.output import again, tell, warn
 from cloudrc.doors.cli.parser import COUNT_MAX, Options, Parser, read_count
-from cloudrc.flight.runs.folder import results_folder
-from cloudrc.flight.runs.requirements import MODES, require
+from cloudrc.flight.folder import results_folder
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -103,7 +103,7 @@ def _write(folder: Path, rows: Sequence[Row]) -> str:
     """Write the table and the figure into a folder; return the table as text."""
     from cloudrc.base.files import write_atomically, write_json
     from cloudrc.base.source import code_hash
-    from cloudrc.flight.runs.flight import fly_in_memory
+    from cloudrc.flight.in_memory import fly_in_memory
     from cloudrc.results.report.document import versions
     from cloudrc.studies.reproduce.figure import draw
     from cloudrc.studies.reproduce.flights import shown

@@ -111,7 +111,7 @@ def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any
     from cloudrc.doors.bridges.ros2.description import RobotFrames, covariances, urdf
     from cloudrc.doors.bridges.ros2.requests import RosRequests
     from cloudrc.doors.console.steering import Steering
-    from cloudrc.flight.drivers.readers import RecordReader
+    from cloudrc.flight.pod.readers import RecordReader
     from cloudrc.results.report.markers import encode_markers, scene_shapes
     from cloudrc.results.report.shapes import read_shapes
 

@@ -14,6 +14,7 @@ from shutil import which
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.base.errors import BadInputError, CloudrcError
+from cloudrc.base.requirements import MODES, require
 from cloudrc.base.text import escape
 from cloudrc.doors.cli.output import (
     output_argument,
@@ -32,9 +33,8 @@ from cloudrc.doors.cli.where import (
     release_from_flags,
     timeout_argument,
 )
-from cloudrc.flight.runs.folder import point_to, run_folder
-from cloudrc.flight.runs.interrupts import is_interrupted
-from cloudrc.flight.runs.requirements import MODES, require
+from cloudrc.flight.folder import point_to, run_folder
+from cloudrc.flight.interrupts import is_interrupted
 
 if TYPE_CHECKING:
     from cloudrc.cluster.client import Release
@@ -127,7 +127,7 @@ def fly_once(options: Options, mode: str, ready: Ready | None = None) -> int:
     With `ready`, fly a session of any number of missions; `ready` is called when the session waits
     for missions.
     """
-    from cloudrc.flight.runs.experiment import check_mode
+    from cloudrc.flight.experiment import check_mode
     from cloudrc.results.metrics.verdict import exit_code
 
     experiment = _experiment(options, is_session=ready is not None)
@@ -165,7 +165,7 @@ def _advise(report: Mapping[str, Any]) -> None:
 
 def _warn(options: Options, experiment: ResolvedExperiment, *flights: ResolvedExperiment) -> None:
     """Warn about the settings of flights, and about own files that have changed since a flight."""
-    from cloudrc.flight.runs.own_files import describe_changes
+    from cloudrc.flight.own_files import describe_changes
 
     warn(*flights)
     fleet = experiment.fleet
@@ -189,7 +189,7 @@ def _experiment(options: Options, *, is_session: bool) -> ResolvedExperiment:
     The missions of a session come later. Its scene thus needs no body that the experiment's own
     mission touches.
     """
-    from cloudrc.flight.runs.experiment import load
+    from cloudrc.flight.experiment import load
 
     try:
         return load(options.experiment, options.set, options.seed, fleets=True)
@@ -203,8 +203,8 @@ def _fly_fleet(experiment: ResolvedExperiment, options: Options, *, is_session: 
     """Fly a fleet, print the summary, and return the exit code."""
     from cloudrc.config.overrides import OUTSIDE
     from cloudrc.doors.cli.progress import Progress
-    from cloudrc.flight.runs.experiment import check_carried, check_mode, robots_of
-    from cloudrc.flight.runs.fleet import fly_fleet
+    from cloudrc.flight.experiment import check_carried, check_mode, robots_of
+    from cloudrc.flight.fleet import fly_fleet
     from cloudrc.results.metrics.verdict import exit_code
     from cloudrc.results.report.fleet import summarize_fleet
 
@@ -258,7 +258,7 @@ def _fly_here(
     are ready.
     """
     from cloudrc.doors.cli.progress import FlightView
-    from cloudrc.flight.runs.fly import fly
+    from cloudrc.flight.fly import fly
 
     mission = experiment.mission
     counted = (0, "waypoint") if ready else (mission.count, mission.unit)

@@ -15,7 +15,7 @@ from cloudrc.doors.cli.output import output_argument, print_result
 from cloudrc.doors.cli.parser import Options, Parser
 
 if TYPE_CHECKING:
-    from cloudrc.flight.runs.see import SecondLook
+    from cloudrc.doors.second_look import SecondLook
     from cloudrc.wire.messages import Vector
 
 EPILOG = """\
@@ -41,7 +41,7 @@ def arguments(parser: Parser) -> None:
 def execute(options: Options) -> None:
     """Print a line for each picture or scan, and what they have in common."""
     from cloudrc.doors.cli.progress import Progress
-    from cloudrc.flight.runs.see import look_again, summarize
+    from cloudrc.doors.second_look import look_again, summarize
 
     with Progress(f"reads the recording of {options.run}"):
         try:

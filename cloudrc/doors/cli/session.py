@@ -19,12 +19,12 @@ from types import SimpleNamespace
 from typing import IO, Any
 
 from cloudrc.base.errors import CloudrcError, NothingFlownError
+from cloudrc.base.requirements import MODES, require
 from cloudrc.doors.cli.output import print_line
 from cloudrc.doors.cli.parser import Options, Parser, whole_number
 from cloudrc.doors.cli.report import report_arguments
 from cloudrc.doors.cli.run import experiment_arguments, fly_once
 from cloudrc.doors.cli.where import run_argument
-from cloudrc.flight.runs.requirements import MODES, require
 
 Say = Callable[[str], None]
 """Function that prints a line above the status line of a flight."""
@@ -84,7 +84,7 @@ def _up(options: Options) -> int:
             stack.enter_context(_beside(say, "cloudrc", "console", str(folder)))
         if options.foxglove:
             words = str(run), str(options.foxglove)
-            stack.enter_context(_beside(say, "cloudrc.flight.processes.foxglove_live", *words))
+            stack.enter_context(_beside(say, "cloudrc.flight.pod.foxglove_live", *words))
 
     from cloudrc.doors.cli.under_way import short
 
@@ -113,7 +113,7 @@ def propose(config: Path) -> tuple[str, str]:
 @contextmanager
 def _beside(say: Say, *words: str) -> Iterator[None]:
     """Run a module during the `with` block; pass its address or its error to `say`."""
-    from cloudrc.flight.drivers.machine import end_process, interpreter
+    from cloudrc.flight.machine import end_process, interpreter
 
     process: subprocess.Popen[Any] = subprocess.Popen(
         interpreter("-m", *words),
@@ -142,8 +142,8 @@ def _beside(say: Say, *words: str) -> Iterator[None]:
 def _down(options: Options) -> None:
     """End a session, and print the path of its report."""
     from cloudrc.doors.cli.under_way import find_session, short
-    from cloudrc.flight.drivers.local import end_session
-    from cloudrc.flight.runs.session import last_mission
+    from cloudrc.flight.local.supervisor import end_session
+    from cloudrc.flight.session import last_mission
 
     run = find_session(options.run)
     end_session(run, DOWN_LIMIT)

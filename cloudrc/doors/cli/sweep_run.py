@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from cloudrc.base.errors import BadInputError, CloudrcError
 from cloudrc.base.files import read_json, write_atomically, write_json
 from cloudrc.base.outside.paths import check_picture
+from cloudrc.base.requirements import MODES, require
 from cloudrc.base.text import escape
 from cloudrc.config.overrides import parse_settings
 from cloudrc.config.sweep import draft_of
@@ -29,9 +30,8 @@ from cloudrc.doors.cli.parser import Options
 from cloudrc.doors.cli.progress import Progress, SeedsView, SweepView
 from cloudrc.doors.cli.report import print_traceback, summary
 from cloudrc.doors.cli.where import release_from_flags
-from cloudrc.flight.runs.experiment import check_mode
-from cloudrc.flight.runs.folder import new_folder
-from cloudrc.flight.runs.requirements import MODES, require
+from cloudrc.flight.experiment import check_mode
+from cloudrc.flight.folder import new_folder
 from cloudrc.flight.trials import summary as summaries
 from cloudrc.flight.trials.bucket import open_rows
 from cloudrc.flight.trials.plan import PlannedFlight, SweepPlan, check, read_draft, unpack

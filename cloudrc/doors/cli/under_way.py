@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 from cloudrc.base.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.doors.cli.output import tell
-from cloudrc.flight.drivers.local import LINK_LOG
-from cloudrc.flight.runs.folder import RUNS
+from cloudrc.flight.folder import RUNS
+from cloudrc.flight.local.places import LINK_LOG
 from cloudrc.results.under_way import SESSION, flight_files, under_way
 
 

@@ -20,6 +20,7 @@ from cloudrc.base.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.base.files import warn_if_readable
 from cloudrc.base.outside.paths import TOKEN_VARIABLE, read_token
 from cloudrc.base.outside.values import InvalidValueError
+from cloudrc.base.requirements import require
 from cloudrc.cluster import DEFAULT_RELEASE as DEFAULT_RELEASE
 from cloudrc.doors.cli.output import tell
 from cloudrc.doors.cli.parser import (
@@ -30,7 +31,6 @@ from cloudrc.doors.cli.parser import (
     number,
     whole_number,
 )
-from cloudrc.flight.runs.requirements import require
 
 if TYPE_CHECKING:
     from cloudrc.cluster.client import Release

@@ -30,7 +30,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from cloudrc.base.files import at_place
 from cloudrc.doors.console.access import PARAMETER, Access
-from cloudrc.flight.drivers.local import socket_folder
+from cloudrc.flight.local.places import socket_folder
 from cloudrc.teleop.server import ThreadServer
 
 if TYPE_CHECKING:

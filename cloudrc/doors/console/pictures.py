@@ -12,7 +12,7 @@ import numpy as np
 import PIL.Image
 from PIL import ImageDraw
 
-from cloudrc.flight.drivers.readers import RecordReader
+from cloudrc.flight.pod.readers import RecordReader
 from cloudrc.teleop.wire import RobotStatus
 from cloudrc.wire.pictures import Image
 from cloudrc.wire.records import FrameKept

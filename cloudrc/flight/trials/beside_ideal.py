@@ -12,7 +12,7 @@ from functools import lru_cache
 
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.schema import Link, MissionConfig
-from cloudrc.flight.runs.flight import fly_in_memory, or_error, row_of
+from cloudrc.flight.in_memory import fly_in_memory, or_error, row_of
 from cloudrc.flight.trials.rows import Row
 from cloudrc.flight.trials.summary import OFF_PATH, TIME_RATIO
 from cloudrc.results.metrics.flight import Array

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from cloudrc.base.errors import MissingPrerequisiteError, describe_error
-from cloudrc.flight.runs.requirements import require
+from cloudrc.base.requirements import require
 from cloudrc.flight.trials.rows import Row, Rows, line_of, take_lines
 
 SCHEME = "s3://"

@@ -17,7 +17,7 @@ from cloudrc.base import plugins, source
 from cloudrc.base.outside.code import is_installed
 from cloudrc.base.outside.reuse import reuse
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.flight.runs.own_files import hash_all, hash_of_module
+from cloudrc.flight.own_files import hash_all, hash_of_module
 
 
 def fingerprint(*facts: Any) -> str:

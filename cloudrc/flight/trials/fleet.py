@@ -22,14 +22,15 @@ from cloudrc.config.fleet import CellConfig
 from cloudrc.config.overrides import OUTSIDE
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.flight import assembly
-from cloudrc.flight.runs import flight
-from cloudrc.flight.runs.experiment import check_no_seed, load, robots_of
-from cloudrc.flight.runs.fleet import assemble_fleet
-from cloudrc.flight.runs.interrupts import raise_if_interrupted
+from cloudrc.flight import in_memory as flight
+from cloudrc.flight.assembly.plan import build_plan
+from cloudrc.flight.experiment import check_no_seed, load, robots_of
+from cloudrc.flight.fleet import assemble_fleet
+from cloudrc.flight.interrupts import raise_if_interrupted
 from cloudrc.flight.trials.fingerprint import experiment_facts, fingerprint
 from cloudrc.flight.trials.plan import PlannedFlight
 from cloudrc.flight.trials.rows import Row
+from cloudrc.flight.virtual.flight import virtual_notes
 from cloudrc.results.record.columns import Recording, RecordStore
 from cloudrc.results.report.document import Assessment, Run
 from cloudrc.results.report.fleet import FleetFlown, fleet_document
@@ -144,7 +145,7 @@ class FleetFlight:
     def _judge(self, number: int) -> Assessment:
         if number not in self._judged:
             robot, recording = self._robots[number], Recording(records=self._stores[number])
-            run = Run("virtual", "virtual", notes=assembly.virtual_notes(robot))
+            run = Run("virtual", "virtual", notes=virtual_notes(robot))
             self._judged[number] = assess(recording, robot, run, robot.report.metrics)
         return self._judged[number]
 
@@ -181,7 +182,7 @@ def _latest_ns(robot: ResolvedExperiment) -> list[int]:
 
     It has to stay at each of the later ones for a time.
     """
-    plan = assembly.build_plan(robot)
+    plan = build_plan(robot)
     stays = [leg.dwell for leg in plan.legs[:0:-1]]
     latest = [round((plan.time_limit - stay) * 1e9) for stay in accumulate(stays, initial=0.0)]
     return [each + LATE_NS for each in latest[::-1]]

@@ -20,8 +20,8 @@ from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.config import sweep
 from cloudrc.config.resolved import ResolvedExperiment, local_files
 from cloudrc.config.sweep import Draft
-from cloudrc.flight.runs import flight
-from cloudrc.flight.runs.experiment import load
+from cloudrc.flight import in_memory as flight
+from cloudrc.flight.experiment import load
 from cloudrc.flight.trials.beside_ideal import fly_beside_ideal, setpoint_waits, without_network
 from cloudrc.flight.trials.fingerprint import experiment_facts, fingerprint, key_of
 from cloudrc.flight.trials.rows import Row

@@ -22,7 +22,7 @@ from cloudrc.base.statistics import (
     sign_test,
 )
 from cloudrc.base.text import FAILED_MARK, FAILED_NOTE, format_number, table
-from cloudrc.flight.runs.flight import counts
+from cloudrc.flight.in_memory import counts
 from cloudrc.flight.trials.rows import Row
 
 NUMBERS = (

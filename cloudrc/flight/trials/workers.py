@@ -19,8 +19,8 @@ from typing import Any, TypeVar
 
 from cloudrc.base.errors import CloudrcError, InterruptedRunError, InvalidRunError, machine_error
 from cloudrc.base.outside.reuse import reuse_results
-from cloudrc.flight.drivers.machine import usable_cores
-from cloudrc.flight.runs.interrupts import is_interrupted, noted_interrupts, raise_if_interrupted
+from cloudrc.flight.interrupts import is_interrupted, noted_interrupts, raise_if_interrupted
+from cloudrc.flight.machine import usable_cores
 
 Work = TypeVar("Work")
 Result = TypeVar("Result")

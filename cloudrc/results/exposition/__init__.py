@@ -3,5 +3,5 @@
 """Compute the Prometheus metrics of a process from its records.
 
 `table` defines all metrics for code, documentation, dashboards and tests. `live` computes the
-current values; `cloudrc.flight.drivers.exporter` serves them over HTTP.
+current values; `cloudrc.flight.pod.exporter` serves them over HTTP.
 """

@@ -28,7 +28,7 @@ from cloudrc.results.report.document import SCHEMA_VERSION
 from cloudrc.results.report.summary import COLOURS
 
 if TYPE_CHECKING:
-    from cloudrc.flight.drivers.fleet import FleetRun
+    from cloudrc.flight.virtual.fleet import FleetRun
 
 GRID_NS = 10_000_000
 """Time between two instants at which robots are compared [ns]: the period of the ground truth."""

@@ -16,11 +16,11 @@ from cloudrc.base.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.base.outside.code import calling, load_file
 from cloudrc.base.outside.refusal import naming
 from cloudrc.base.outside.values import InvalidValueError
+from cloudrc.base.requirements import SIM, require
 from cloudrc.config.choice import PlugIn
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.robot import RobotFacts, facts
 from cloudrc.config.world import ResolvedWorld
-from cloudrc.flight.runs.requirements import SIM, require
 from cloudrc.results.metrics.measure import find
 from cloudrc.studies.check import tried
 from cloudrc.studies.check.contract import CHECKS

@@ -11,8 +11,8 @@ import numpy as np
 
 from cloudrc.base.outside.values import InvalidValueError
 from cloudrc.base.plugins import one
-from cloudrc.flight.runs.experiment import load
-from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.flight.experiment import load
+from cloudrc.flight.in_memory import fly_in_memory
 from cloudrc.results.metrics.measure import METRIC_NOTE, find
 from cloudrc.results.report.document import Assessment
 from cloudrc.results.report.summary import readable

@@ -14,7 +14,7 @@ import gymnasium
 from cloudrc.base.outside.code import OWN
 from cloudrc.base.plugins import is_path
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.flight.runs.own_files import hashes
+from cloudrc.flight.own_files import hashes
 from cloudrc.flight.trials.fingerprint import code_of, experiment_facts, fingerprint
 from cloudrc.gym.step import layers
 from cloudrc.gym.values import leaves

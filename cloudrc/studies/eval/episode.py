@@ -28,7 +28,7 @@ from cloudrc.base.files import write_json
 from cloudrc.base.outside.code import calling
 from cloudrc.base.outside.refusal import naming
 from cloudrc.base.outside.values import ANY, InvalidValueError
-from cloudrc.flight.drivers.openpi.actions import PolicyAnswerError, read_actions
+from cloudrc.flight.pod.openpi.actions import PolicyAnswerError, read_actions
 from cloudrc.gym import Channel, Networked
 from cloudrc.gym.answers import to_document
 from cloudrc.gym.options import ANSWER
@@ -133,8 +133,8 @@ def asking(setup: EvalSetup, robot: int = 0) -> Iterator[Ask]:
         policy.reset()
         yield policy.infer
         return
-    from cloudrc.flight.drivers.openpi import KEY_VARIABLE
-    from cloudrc.flight.drivers.openpi.client import PolicyClient
+    from cloudrc.flight.pod.openpi import KEY_VARIABLE
+    from cloudrc.flight.pod.openpi.client import PolicyClient
 
     with PolicyClient(setup.policy, key=os.environ.get(KEY_VARIABLE, "")) as client:
         yield client.infer

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from cloudrc.base.outside.code import sources
 from cloudrc.base.outside.reuse import reuse
 from cloudrc.base.plugins import is_path
-from cloudrc.flight.runs.own_files import hash_of
+from cloudrc.flight.own_files import hash_of
 from cloudrc.flight.trials.fingerprint import fingerprint
 from cloudrc.gym.lane import DATAGRAMS, Wire
 from cloudrc.gym.options import ANSWER

@@ -30,8 +30,8 @@ from cloudrc.cloud.estimators import DelaySample
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.task import FormulaName, Task, TestConfig
-from cloudrc.flight.runs.flight import fly_in_memory
-from cloudrc.flight.runs.own_files import hash_all
+from cloudrc.flight.in_memory import fly_in_memory
+from cloudrc.flight.own_files import hash_all
 from cloudrc.results.metrics import measure
 from cloudrc.wire.messages import UPRIGHT, ZERO, Odometry, Setpoint
 

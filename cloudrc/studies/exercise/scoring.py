@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from cloudrc.base.errors import TEXT_MAX, to_one_line
 from cloudrc.config.task import read_task
-from cloudrc.flight.drivers.machine import await_or_kill, interpreter, signal_group
+from cloudrc.flight.machine import await_or_kill, interpreter, signal_group
 from cloudrc.studies.exercise import hand_in as part_process
 from cloudrc.studies.exercise.files import SHIPPED, HandIn, describe_missing
 from cloudrc.studies.exercise.score import sum_up

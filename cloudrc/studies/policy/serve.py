@@ -20,8 +20,8 @@ from websockets.http11 import Request, Response
 
 from cloudrc.base.errors import describe_error
 from cloudrc.base.files import at_place
-from cloudrc.flight.drivers.openpi.actions import PolicyAnswerError, read_actions
-from cloudrc.flight.drivers.openpi.codec import MESSAGE_MAX, WireError, pack, unpack
+from cloudrc.flight.pod.openpi.actions import PolicyAnswerError, read_actions
+from cloudrc.flight.pod.openpi.codec import MESSAGE_MAX, WireError, pack, unpack
 from cloudrc.studies.policy.load import LoadedPolicy, PolicyFailedError
 
 HEALTH = "/healthz"

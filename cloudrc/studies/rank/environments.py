@@ -15,8 +15,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from cloudrc.base.requirements import SIM, require
 from cloudrc.config.world import ResolvedWorld
-from cloudrc.flight.runs.requirements import SIM, require
 from cloudrc.gym.linear import Linear
 from cloudrc.gym.testbed import RobotEnv
 from cloudrc.link.draws import Floats

@@ -18,9 +18,9 @@ from cloudrc.base.errors import CloudrcError
 from cloudrc.base.outside.code import sources
 from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.base.plugins import is_path
-from cloudrc.flight.runs.experiment import load
-from cloudrc.flight.runs.own_files import hash_of
-from cloudrc.flight.runs.requirements import EXTRAS
+from cloudrc.base.requirements import EXTRAS
+from cloudrc.flight.experiment import load
+from cloudrc.flight.own_files import hash_of
 from cloudrc.flight.trials.fingerprint import experiment_facts, fingerprint
 from cloudrc.flight.trials.plan import PlannedFlight
 from cloudrc.flight.trials.play import Trial, run

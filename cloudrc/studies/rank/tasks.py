@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.base.outside.document import read_document
+from cloudrc.base.requirements import SIM, missing
 from cloudrc.config.shipped import FOLDERS
-from cloudrc.flight.runs.own_files import DIGITS
-from cloudrc.flight.runs.requirements import SIM, missing
+from cloudrc.flight.own_files import DIGITS
 
 VERSION = "1"
 GRID = (0.0, 10.0, 20.0, 50.0, 100.0, 150.0, 200.0, 300.0, 450.0, 600.0)

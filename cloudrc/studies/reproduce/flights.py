@@ -13,8 +13,8 @@ from typing import NamedTuple
 from cloudrc.base.outside.reuse import reuse_results
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.flight.runs.experiment import load
-from cloudrc.flight.runs.flight import fly_in_memory, or_error, row_of
+from cloudrc.flight.experiment import load
+from cloudrc.flight.in_memory import fly_in_memory, or_error, row_of
 from cloudrc.flight.trials.fingerprint import experiment_facts, fingerprint
 from cloudrc.flight.trials.plan import PlannedFlight
 from cloudrc.flight.trials.rows import Row

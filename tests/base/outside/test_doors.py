@@ -22,7 +22,7 @@ from cloudrc.config.profile import Profile
 from cloudrc.config.schema import Experiment
 from cloudrc.doors import api
 from cloudrc.doors.cli.parser import COMMANDS, NumberFlag, build_parser
-from cloudrc.flight.runs.experiment import load
+from cloudrc.flight.experiment import load
 from cloudrc.gym import Networked
 from cloudrc.link import open as open_link
 from cloudrc.link.library import read_profile

@@ -11,8 +11,8 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.doors.cli.main import main
-from cloudrc.flight import assembly
-from cloudrc.flight.drivers.companion import companion
+from cloudrc.flight.local.companion import companion
+from cloudrc.flight.virtual.flight import fly_virtual
 from cloudrc.results.record.columns import Recording, RecordStore
 from tests.doors.bridges.conftest import needs_ros
 
@@ -36,7 +36,7 @@ def example(names="controller", namespace=""):
 def built_in(settings, **how):
     """Fly in virtual time; return the true path."""
     store = RecordStore()
-    assembly.fly(load_experiment("paper", settings), store.add, **how)
+    fly_virtual(load_experiment("paper", settings), store.add, **how)
     truth = Recording(records=store)["/ground_truth"]
     return np.column_stack((truth["stamp_ns"], truth["position"], truth["velocity"]))
 

@@ -12,7 +12,7 @@ from cloudrc.base import plugins
 from cloudrc.base.errors import BadInputError
 from cloudrc.config.load import load_experiment
 from cloudrc.doors.cli.main import main
-from cloudrc.flight.runs.experiment import check_mode
+from cloudrc.flight.experiment import check_mode
 from cloudrc.results.record.live import (
     decode_stamped_twist,
     encode_clock,

@@ -17,7 +17,7 @@ import pytest
 from cloudrc.doors.bridges.ros2.description import RobotFrames, urdf
 from cloudrc.doors.bridges.ros2.requests import RosRequests
 from cloudrc.doors.console.steering import Steering
-from cloudrc.flight.drivers.readers import RecordReader, RecordSender
+from cloudrc.flight.pod.readers import RecordReader, RecordSender
 from cloudrc.physics.geometry.scene import Scene
 from cloudrc.physics.geometry.shapes import Shapes
 from cloudrc.results.report.markers import encode_markers, scene_shapes

@@ -20,4 +20,4 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def replace_flights(one_core, monkeypatch):
     """Return a function that replaces flights by `fly(experiment)`, in this process."""
-    return lambda fly: monkeypatch.setattr("cloudrc.flight.runs.flight.measure", fly)
+    return lambda fly: monkeypatch.setattr("cloudrc.flight.in_memory.measure", fly)

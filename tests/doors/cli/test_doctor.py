@@ -11,10 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from cloudrc.base import requirements
 from cloudrc.base.errors import MissingPrerequisiteError
 from cloudrc.doors.cli import doctor as work
 from cloudrc.doors.cli.doctor import Check
-from cloudrc.flight.runs import requirements
 from cloudrc.link.exec import namespace
 from cloudrc.physics.sim import egl
 from tests.support.camera import needs_renderer

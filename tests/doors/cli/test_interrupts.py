@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.flight.runs.interrupts import interrupt_on_signals
+from cloudrc.flight.interrupts import interrupt_on_signals
 from cloudrc.flight.trials.plan import PlannedFlight
 from cloudrc.flight.trials.rows import read_rows
 

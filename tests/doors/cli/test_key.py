@@ -7,7 +7,7 @@ import stat
 
 import pytest
 
-from cloudrc.flight.drivers.keyfile import read_keys
+from cloudrc.flight.pod.keyfile import read_keys
 from cloudrc.wire.tunnel.keys import KeySet
 
 

@@ -5,7 +5,7 @@
 import pytest
 
 from cloudrc.base.errors import StateError
-from cloudrc.flight.runs.links import programs
+from cloudrc.flight.links import programs
 
 
 @pytest.mark.parametrize("place", ["environment", "command"])

@@ -13,9 +13,9 @@ import pytest
 from cloudrc.base.files import write_atomically
 from cloudrc.base.outside.document import Document
 from cloudrc.config.link_edit import edit_profile
-from cloudrc.flight.drivers.link_control import ControlServer
-from cloudrc.flight.drivers.local import link_socket
-from cloudrc.flight.processes.link import make_profile_loader
+from cloudrc.flight.local.places import link_socket
+from cloudrc.flight.pod.link import make_profile_loader
+from cloudrc.flight.pod.link_control import ControlServer
 from cloudrc.link.follow import Profiles
 from cloudrc.link.profile import summary
 from cloudrc.link.state import LinkState, to_text
@@ -116,7 +116,7 @@ def test_only_its_user_can_open_the_socket_of_a_link(flight):
 
 def test_a_link_that_does_not_answer_is_an_error(flight, monkeypatch, refused):
     flight[1].deaf = True
-    monkeypatch.setattr("cloudrc.flight.drivers.link_control.APPLY_LIMIT", 0.2)
+    monkeypatch.setattr("cloudrc.flight.pod.link_control.APPLY_LIMIT", 0.2)
     said = refused("link set downlink.delay_ms=120", code=4)
     assert "the downlink did not apply the change within" in said
     assert "see runs/latest/downlink.log" in said

@@ -12,8 +12,8 @@ import pytest
 
 from cloudrc.cluster import verify
 from cloudrc.cluster.verify import verify_release
-from cloudrc.flight.drivers.exporter import Exporter
-from cloudrc.flight.runs.links.verify import OF_PROGRAMS, as_text
+from cloudrc.flight.links.verify import OF_PROGRAMS, as_text
+from cloudrc.flight.pod.exporter import Exporter
 from cloudrc.wire.records import LinkChecked
 
 PAGE = {"shaper": "relay", "reason": "", "interface": "eth0", "netems": {}}

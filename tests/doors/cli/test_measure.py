@@ -9,7 +9,8 @@ import pytest
 
 from cloudrc.config.compute import compute_times
 from cloudrc.doors.cli.eval_values import read_compute
-from cloudrc.flight.drivers import cpu_limit, machine
+from cloudrc.flight import machine
+from cloudrc.studies import cpu_limit
 from tests.doors.cli.conftest import FLY
 
 TIMES = ["--report", "none", "--set", "link.profile=paper-p1", "--set"]

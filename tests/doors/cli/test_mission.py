@@ -35,7 +35,7 @@ def api():
 
 @pytest.fixture(autouse=True)
 def quick(folder, monkeypatch):
-    monkeypatch.setattr("cloudrc.flight.runs.missions.POLL_PERIOD", 0.02)
+    monkeypatch.setattr("cloudrc.doors.missions.POLL_PERIOD", 0.02)
     monkeypatch.setattr(command, "API_TIMEOUT", 0.5)
     monkeypatch.setenv("KUBECONFIG", str(folder / "none"))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))

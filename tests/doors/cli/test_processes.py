@@ -13,10 +13,9 @@ import pytest
 from cloudrc.base.errors import ControllerLostError
 from cloudrc.doors.cli.parser import read_size
 from cloudrc.doors.cli.processes import read_address
-from cloudrc.flight import assembly
-from cloudrc.flight.drivers import realtime
-from cloudrc.flight.drivers.realtime import free_ports, show_address
-from cloudrc.flight.processes import ends
+from cloudrc.flight.assembly.cloud import build_cloud
+from cloudrc.flight.pod import ends, realtime
+from cloudrc.flight.pod.realtime import free_ports, show_address
 from cloudrc.results.record.columns import Recording
 from tests.results.record.conftest import MS, counted, world_records
 
@@ -47,13 +46,13 @@ def test_an_address_of_ipv6_is_in_brackets(monkeypatch):
 @pytest.mark.parametrize("end", ENDS)
 def test_an_end_stopped_at_its_start_completes_its_recording(end, key, tmp_path, monkeypatch, call):
     """The handlers are set first: as the first process of a container, an end needs them."""
-    build = getattr(assembly, f"build_{end}")
+    build = getattr(ends, f"build_{end}")
 
     def stop_and_build(*arguments, **named):
         os.kill(os.getpid(), signal.SIGTERM)
         return build(*arguments, **named)
 
-    monkeypatch.setattr(assembly, f"build_{end}", stop_and_build)
+    monkeypatch.setattr(ends, f"build_{end}", stop_and_build)
     (tmp_path / "key").chmod(0o644)
     flags = f"--listen 127.0.0.1:{free_ports(1)[0]} --route route {key} --record end.mcap"
     flags += " --teleop teleop" if end == "cloud" else ""
@@ -65,7 +64,7 @@ def test_an_end_stopped_at_its_start_completes_its_recording(end, key, tmp_path,
 @pytest.mark.child
 def test_cloud_without_a_supervisor_ends_if_its_controller_is_lost(key, monkeypatch, refused):
     """In a pod, Kubernetes starts it again: the next mission gets a new controller."""
-    build, bound = assembly.build_cloud, []
+    build, bound = build_cloud, []
 
     def bind(address):
         bound.append(realtime.bind(address))
@@ -78,7 +77,7 @@ def test_cloud_without_a_supervisor_ends_if_its_controller_is_lost(key, monkeypa
         return cloud
 
     monkeypatch.setattr(ends, "bind", bind)
-    monkeypatch.setattr(assembly, "build_cloud", build_lost)
+    monkeypatch.setattr(ends, "build_cloud", build_lost)
     flags = f"--listen 127.0.0.1:{free_ports(1)[0]} --route route {key} --record end.mcap"
     line = refused(f"process cloud --config hover {flags} --teleop teleop", code=5)
     assert line == "cloudrc: error: no node answers\n"

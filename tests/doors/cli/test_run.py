@@ -8,8 +8,8 @@ from unittest.mock import Mock
 
 import pytest
 
+from cloudrc.base import requirements
 from cloudrc.doors.cli.main import main
-from cloudrc.flight.runs import requirements
 from cloudrc.results.metrics.verdict import FlightFailure, FlightVerdict
 from cloudrc.results.report.figures import FIGURES
 from tests.doors.cli.conftest import FLY, SHORT
@@ -92,7 +92,7 @@ def test_a_run_and_its_report_can_be_repeated(folder, call, as_json):
 @pytest.mark.parametrize(
     ("fails", "error", "code", "said"),
     [
-        ("flight.runs.fly.write_report", KeyboardInterrupt, 130,
+        ("flight.fly.write_report", KeyboardInterrupt, 130,
          "to write its report: cloudrc report here"),
         ("results.report.write.write_json",
          OSError(28, "No space left on device", "here/report.json"), 3,

@@ -90,7 +90,7 @@ def test_an_interrupted_fleet_has_a_report(folder, call, monkeypatch):
     def interrupt(run):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("cloudrc.flight.drivers.fleet.FleetRun.fly", interrupt)
+    monkeypatch.setattr("cloudrc.flight.virtual.fleet.FleetRun.fly", interrupt)
     line = [*FLY, *FLEET, "--report", "none", "--out", "fleet"]
     assert "INTERRUPTED: 3 of 3 robots did not succeed" in call(*line, code=130).out
     assert json.loads((folder / "fleet/report.json").read_text())["cell"] == []

@@ -18,9 +18,9 @@ from websockets.sync.client import connect
 from cloudrc.config.load import load_experiment, read_experiment
 from cloudrc.config.resolved import dump
 from cloudrc.doors.cli import session
-from cloudrc.flight.drivers import local
-from cloudrc.flight.drivers.machine import usable_cores
-from cloudrc.flight.drivers.realtime import free_ports
+from cloudrc.flight.local import supervisor
+from cloudrc.flight.machine import usable_cores
+from cloudrc.flight.pod.realtime import free_ports
 from cloudrc.results import under_way
 from cloudrc.results.record.columns import Recording
 from cloudrc.teleop.client import Api, ApiError
@@ -29,7 +29,7 @@ from cloudrc.teleop.wire import Leg, Plan
 from cloudrc.wire.messages import Start
 from cloudrc.wire.records import TelemetrySent
 from tests.conftest import wait_until
-from tests.flight.drivers.conftest import COMMAND, processes_of
+from tests.flight.conftest import COMMAND, processes_of
 from tests.results.record.conftest import cloud_records, world_records, write
 
 USING = "cloudrc: using the run in s\n"
@@ -38,7 +38,7 @@ USING = "cloudrc: using the run in s\n"
 @pytest.fixture
 def down(monkeypatch, call):
     """Return a function that runs `cloudrc down`, which ends no session; it returns the output."""
-    monkeypatch.setattr(local, "end_session", lambda run, limit: None)
+    monkeypatch.setattr(supervisor, "end_session", lambda run, limit: None)
     return lambda code, flags="": "".join(call(f"down {flags}", code=code))
 
 

@@ -18,9 +18,9 @@ import pytest
 
 from cloudrc.base.source import code_hash
 from cloudrc.cluster import batch
-from cloudrc.flight.assembly import assemble
 from cloudrc.flight.trials.plan import PlannedFlight, read_plan, unpack
 from cloudrc.flight.trials.rows import read_rows
+from cloudrc.flight.virtual.flight import assemble
 from tests.conftest import wait_until
 from tests.doors.cli.conftest import SHORT
 from tests.support.sweeps import flown
@@ -127,7 +127,7 @@ def break_seed_2(monkeypatch):
                 raise error
             return assemble(experiment, *given, **named)
 
-        monkeypatch.setattr("cloudrc.flight.assembly.assemble", fly)
+        monkeypatch.setattr("cloudrc.flight.virtual.flight.assemble", fly)
 
     return use
 

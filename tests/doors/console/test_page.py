@@ -16,8 +16,8 @@ from cloudrc.doors.console.controls import KEYS, Controls
 from cloudrc.doors.console.feed import FlightFeed
 from cloudrc.doors.console.page import PANEL_WIDTH, Page
 from cloudrc.doors.console.steering import Steering
-from cloudrc.flight.drivers.local import LINK_FOLDER
-from cloudrc.flight.runs.links.change import read_states
+from cloudrc.flight.links.change import read_states
+from cloudrc.flight.local.places import LINK_FOLDER
 from tests.conftest import wait_until
 from tests.doors.console.conftest import (
     LIMIT,

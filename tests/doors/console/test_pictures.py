@@ -10,7 +10,7 @@ import pytest
 
 from cloudrc.doors.console import pictures
 from cloudrc.doors.console.pictures import PictureFeed
-from cloudrc.flight.drivers.readers import RecordSender
+from cloudrc.flight.pod.readers import RecordSender
 from tests.doors.console.conftest import status
 
 MS = 1_000_000

@@ -12,7 +12,7 @@ import numpy as np
 from cloudrc.config.load import read_experiment
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.schema import MissionConfig
-from cloudrc.flight import assembly
+from cloudrc.flight.assembly.plan import build_plan
 from cloudrc.physics.geometry.obstacles import fence_of
 from cloudrc.physics.geometry.scene import Tube
 from cloudrc.wire.messages import Command, GuardState, Vector
@@ -267,7 +267,7 @@ def _unreachable(outcome: Outcome) -> None:
     outcome.true("it says which waypoint", "waypoint" in verdict and "not reached" in verdict)
     ended = max(event.stamp_ns for event in flight.events("leg_timed_out")) * 1e-9
     reached = flight.events("reached")
-    leg, began = assembly.build_plan(flight.experiment).legs[len(reached)], reached[-1].stamp_ns
+    leg, began = build_plan(flight.experiment).legs[len(reached)], reached[-1].stamp_ns
     off = abs(ended - began * 1e-9 - leg.time_limit)
     outcome.most("deviation of the leg's end from its limit", off, 0.05, "s")
     flight.fly(flight.now + 10.0)

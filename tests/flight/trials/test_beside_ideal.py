@@ -4,7 +4,7 @@
 
 import pytest
 
-from cloudrc.flight.runs.experiment import load
+from cloudrc.flight.experiment import load
 from cloudrc.flight.trials.beside_ideal import fly_beside_ideal
 from tests.conftest import nightly_rows
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.flight.drivers.realtime import free_ports
+from cloudrc.flight.pod.realtime import free_ports
 
 pytestmark = pytest.mark.process
 

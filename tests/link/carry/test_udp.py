@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from cloudrc.config.shipped import names
-from cloudrc.flight.drivers.realtime import free_ports
-from cloudrc.flight.runs.links.under_test import WAYS, measure, run_link
-from cloudrc.flight.runs.links.verify import find_experiment
+from cloudrc.flight.links.under_test import WAYS, measure, run_link
+from cloudrc.flight.links.verify import find_experiment
+from cloudrc.flight.pod.realtime import free_ports
 from cloudrc.link.carry import udp as module
 from cloudrc.link.carry.udp import Relay, ask_for_stamps
 from cloudrc.link.model import LinkDirection

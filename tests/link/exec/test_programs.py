@@ -18,8 +18,8 @@ import pytest
 
 from cloudrc.base.errors import MissingPrerequisiteError
 from cloudrc.config.profile import load_profile
-from cloudrc.flight.drivers.namespaces import ProgramEnd
-from cloudrc.flight.drivers.realtime import free_ports
+from cloudrc.flight.links.namespaces import ProgramEnd
+from cloudrc.flight.pod.realtime import free_ports
 from cloudrc.link.exec.namespace import identity
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile

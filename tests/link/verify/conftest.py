@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from cloudrc.config.profile import load_profile
-from cloudrc.flight.drivers.link_monitor import LinkMonitor
+from cloudrc.flight.pod.link_monitor import LinkMonitor
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.causes import Findings

@@ -9,9 +9,9 @@ from contextlib import contextmanager
 import pytest
 
 from cloudrc.base.errors import CloudrcError, MissingPrerequisiteError
-from cloudrc.flight.runs.links import under_test
-from cloudrc.flight.runs.links.under_test import DEVICE, HOSTS, run_link
-from cloudrc.flight.runs.links.verify import (
+from cloudrc.flight.links import under_test
+from cloudrc.flight.links.under_test import DEVICE, HOSTS, run_link
+from cloudrc.flight.links.verify import (
     as_text,
     find_experiment,
     make_plans,

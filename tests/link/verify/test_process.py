@@ -9,9 +9,9 @@ import subprocess
 import pytest
 
 from cloudrc.base.errors import CloudrcError
-from cloudrc.flight.runs.links import under_test, verify
-from cloudrc.flight.runs.links.under_test import run_link
-from cloudrc.flight.runs.links.verify import find_experiment, make_plans, probe_link
+from cloudrc.flight.links import under_test, verify
+from cloudrc.flight.links.under_test import run_link
+from cloudrc.flight.links.verify import find_experiment, make_plans, probe_link
 from cloudrc.link.verify import verdict_of
 from cloudrc.link.verify.causes import find_causes
 

@@ -12,7 +12,7 @@ from cloudrc.config.overrides import parse_settings
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import find_robot
 from cloudrc.config.shipped import file_of
-from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.flight.in_memory import fly_in_memory
 from cloudrc.physics.sim.energy import power_factors
 from cloudrc.physics.sim.scene import compile_model
 from cloudrc.robots.build import build_robot

@@ -12,7 +12,7 @@ from functools import cache
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Criteria, MissionConfig, Touch, Waypoint
 from cloudrc.config.world import ResolvedWorld
-from cloudrc.flight.runs.flight import fly_in_memory
+from cloudrc.flight.in_memory import fly_in_memory
 from cloudrc.physics.geometry.scene import Plate, Scene, Tube
 from cloudrc.results.metrics.flight import Flight
 from cloudrc.results.metrics.measure import SHIPPED, measure_all

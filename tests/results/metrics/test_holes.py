@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cloudrc.flight.runs.links.trace import one_way
+from cloudrc.flight.links.trace import one_way
 from cloudrc.results.metrics.measure import IN_SPITE_OF_HOLES, SHIPPED, measure_all
 from cloudrc.results.metrics.response import steps
 from cloudrc.results.record.holes import END_NS, SOMEWHERE, Hole

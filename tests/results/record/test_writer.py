@@ -95,5 +95,5 @@ def test_a_flight_needs_no_package_for_recording():
     absent = "import sys; sys.modules |= dict.fromkeys(('mcap', 'rosbags'))"
     loaded(
         f"{absent}; {topics}; from cloudrc.results.record.columns import Recording;"
-        "import cloudrc.flight.drivers.recording; Recording.from_records([])['/pid']"
+        "import cloudrc.flight.pod.recording; Recording.from_records([])['/pid']"
     )

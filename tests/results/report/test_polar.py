@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.flight import assembly
+from cloudrc.flight.virtual.flight import fly_virtual
 from cloudrc.results.record.columns import Recording, RecordStore
 from cloudrc.results.report.flown import flight_of
 from cloudrc.results.report.polar import write_polar
@@ -21,7 +21,7 @@ SHORT = ["mission.waypoints=[{position_m: [1.5, 0], tolerance_m: 0.5}]", "link.b
 @pytest.fixture(scope="module")
 def flown():
     experiment, store = load_experiment("gap", SHORT), RecordStore()
-    assembly.fly(experiment, store.add)
+    fly_virtual(experiment, store.add)
     return experiment, Recording(records=store)
 
 

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from cloudrc.config.load import load_experiment
-from cloudrc.flight.runs.fly import fly
+from cloudrc.flight.fly import fly
 from cloudrc.physics.geometry.scene import load_scene
 from cloudrc.results.record.columns import Recording
 

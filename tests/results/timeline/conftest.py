@@ -5,7 +5,7 @@
 from functools import cache
 
 from cloudrc.config.load import load_experiment
-from cloudrc.flight import assembly
+from cloudrc.flight.virtual.flight import assemble
 from cloudrc.results.record.merge import merge
 from cloudrc.results.record.writer import McapWriter
 from cloudrc.results.timeline.read import read_flight
@@ -28,7 +28,7 @@ SETTINGS = {
 def records(*settings, experiment="hover", lasts_s=3):
     """Fly for `lasts_s`; return the records of world and of cloud."""
     experiment = load_experiment(experiment, settings)
-    _, _, teleop, run = assembly.assemble(experiment)
+    _, _, teleop, run = assemble(experiment)
     found = [], []
 
     def sink(*new):

@@ -14,7 +14,7 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.flight import assembly
+from cloudrc.flight.assembly.world import build_world
 from cloudrc.physics.sim.engine import mujoco
 from cloudrc.physics.sim.memory import without_contacts
 from cloudrc.physics.sim.onboard import Accelerator, Direct
@@ -307,18 +307,18 @@ def test_in_air_that_acts_on_geoms_c_uses_the_whole_model():
 )  # fmt: skip
 def test_an_experiment_has_the_same_records_in_c(name, settings, monkeypatch):
     experiment, identity = load_experiment(name, settings), Identity(CLOCK, bytes(16), ring())
-    assert isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
+    assert isinstance(build_world(experiment, identity).robot, NativeRobot)
     in_c = sha256(experiment)
     monkeypatch.setenv(SWITCH, "0")
     assert sha256(experiment) == in_c
-    assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
+    assert not isinstance(build_world(experiment, identity).robot, NativeRobot)
 
 
 @pytest.mark.parametrize("setting", ["wind.velocity_mps=[0, 1]", "plant.mass_factor=1.1"])
 def test_what_c_cannot_simulate_is_flown_in_python(setting):
     experiment = load_experiment("hover", [f"world.{setting}"])
     identity = Identity(CLOCK, bytes(16), ring())
-    assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
+    assert not isinstance(build_world(experiment, identity).robot, NativeRobot)
 
 
 def test_observers_and_a_tape_see_every_step():

@@ -18,8 +18,8 @@ from cloudrc.doors.cli.eval_values import (
     read_compute,
     read_mapped,
 )
-from cloudrc.flight.drivers.openpi.actions import PolicyAnswerError
-from cloudrc.flight.drivers.openpi.codec import pack
+from cloudrc.flight.pod.openpi.actions import PolicyAnswerError
+from cloudrc.flight.pod.openpi.codec import pack
 from cloudrc.studies.eval.episode import as_actions, play, width_of
 from cloudrc.studies.eval.setup import Episode, EvalSetup, link_at
 from cloudrc.studies.policy.observation import Mapped, observe

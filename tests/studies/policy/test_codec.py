@@ -6,7 +6,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from cloudrc.flight.drivers.openpi.codec import WireError, pack, unpack
+from cloudrc.flight.pod.openpi.codec import WireError, pack, unpack
 from tests.tensors import KINDS, Tensor
 
 

@@ -11,12 +11,12 @@ import pytest
 from cloudrc.base.errors import BadInputError, ControllerLostError
 from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.config.load import load_experiment
-from cloudrc.flight import assembly
-from cloudrc.flight.drivers.openpi.codec import unpack
-from cloudrc.flight.drivers.realtime import free_ports
-from cloudrc.flight.drivers.transports import remote
-from cloudrc.flight.runs.experiment import check_mode
-from cloudrc.flight.runs.fly import fly
+from cloudrc.flight.experiment import check_mode
+from cloudrc.flight.fly import fly
+from cloudrc.flight.pod.openpi.codec import unpack
+from cloudrc.flight.pod.realtime import free_ports
+from cloudrc.flight.pod.transports import remote
+from cloudrc.flight.virtual.flight import fly_virtual
 from cloudrc.results.record.columns import Recording, RecordStore
 from cloudrc.wire.messages import UPRIGHT, ZERO, Odometry, Setpoint
 from cloudrc.wire.records import UNSENT
@@ -51,7 +51,7 @@ def experiment(url, *settings):
 
 def true_path(flown):
     store = RecordStore()
-    assembly.fly(flown, store.add)
+    fly_virtual(flown, store.add)
     truth = Recording(records=store)["/ground_truth"]
     return np.column_stack((truth["stamp_ns"], truth["position"], truth["velocity"]))
 
@@ -68,7 +68,7 @@ def test_a_served_policy_that_returns_none_sends_nothing(policy):
     often = "calls = []\n" + PID.replace("    return {", every_third)
     store = RecordStore()
     with serving(policy(often)) as url:
-        assembly.fly(experiment(url), store.add)
+        fly_virtual(experiment(url), store.add)
     sent = Recording(records=store)["/delay_estimate"]["counter"]
     assert np.mean(sent == UNSENT) == pytest.approx(2 / 3, abs=0.01)
 

@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect
 
 from cloudrc.base.errors import CloudrcError
-from cloudrc.flight.drivers.openpi.client import PolicyClient, PolicyServerError, SilentServerError
+from cloudrc.flight.pod.openpi.client import PolicyClient, PolicyServerError, SilentServerError
 from tests.studies.policy.conftest import actions, serving, stock_like
 
 STATE = {"state": np.arange(3.0)}

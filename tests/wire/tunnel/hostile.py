@@ -18,7 +18,8 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[3]))  # it is a program, too
 
-from cloudrc.flight.assembly import build_cloud, start_mission
+from cloudrc.flight.assembly.cloud import build_cloud
+from cloudrc.flight.virtual.flight import start_mission
 from cloudrc.wire.records import Fault
 from cloudrc.wire.tunnel import codec
 from cloudrc.wire.tunnel.codec import Kind

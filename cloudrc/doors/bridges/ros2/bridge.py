@@ -34,7 +34,7 @@ from cloudrc.doors.bridges.ros2.mission import MissionNews, Navigation
 from cloudrc.doors.bridges.ros2.own_node import NEWEST, QUEUED, OwnNode
 from cloudrc.doors.bridges.ros2.requests import RosRequests
 from cloudrc.doors.console.steering import VERBS, Steering
-from cloudrc.flight.drivers.readers import RecordReader
+from cloudrc.flight.pod.readers import RecordReader
 from cloudrc.physics.geometry.shapes import Pose
 from cloudrc.results.record.live import (
     EXACT,

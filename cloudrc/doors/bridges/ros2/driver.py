@@ -15,8 +15,8 @@ from typing import Any
 
 from cloudrc.base.errors import ControllerLostError
 from cloudrc.doors.bridges.ros2.node import WAKE, RosAnswer, RosNode
-from cloudrc.flight.drivers.openpi.codec import pack, unpack
-from cloudrc.flight.drivers.teleop import UnixDatagrams
+from cloudrc.flight.pod.openpi.codec import pack, unpack
+from cloudrc.flight.pod.teleop_link import UnixDatagrams
 
 LOOK_PERIOD = 0.5
 """Time between two looks at the nodes [s], and the silence after which cloud is told about it."""

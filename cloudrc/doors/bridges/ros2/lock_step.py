@@ -10,7 +10,7 @@ from typing import Any
 
 from cloudrc.base.errors import ControllerLostError
 from cloudrc.doors.bridges.ros2.node import WAKE, RosNode
-from cloudrc.flight.drivers.transports.remote import SILENT, VIRTUAL_LIMIT
+from cloudrc.flight.pod.transports.remote import SILENT, VIRTUAL_LIMIT
 
 SETTLE = 0.2
 """Time after both ends are found until the first estimate [s]: the node must have found us, too."""

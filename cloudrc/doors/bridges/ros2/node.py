@@ -28,7 +28,7 @@ from cloudrc.doors.bridges.ros2.own_node import (
     known,
     name_of,
 )
-from cloudrc.flight.drivers.transports.remote import INVALID
+from cloudrc.flight.pod.transports.remote import INVALID
 from cloudrc.results.record.live import (
     WORLD,
     decode_stamped_twist,

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.doors.bridges.ros2 import require_ros
-from cloudrc.flight.runs.interrupts import until_interrupted
-from cloudrc.flight.runs.links.carrier import STEP, CarrySettings, LiveLink
-from cloudrc.flight.runs.links.programs_report import make_link_report, write_report
-from cloudrc.flight.runs.links.verify import Report
+from cloudrc.flight.interrupts import until_interrupted
+from cloudrc.flight.links.carrier import STEP, CarrySettings, LiveLink
+from cloudrc.flight.links.programs_report import make_link_report, write_report
+from cloudrc.flight.links.verify import Report
 from cloudrc.link.carry.engine import Engine
 from cloudrc.link.carry.punctual import ask_for_fifo, settle
 from cloudrc.link.carry.tcp.medium import Medium

@@ -12,7 +12,7 @@ from cloudrc.doors.bridges.ros2 import require_ros
 if TYPE_CHECKING:
     from cloudrc.doors.bridges.ros2.driver import RosDriver
     from cloudrc.doors.bridges.ros2.lock_step import RosLockStep
-    from cloudrc.flight.drivers.teleop import UnixDatagrams
+    from cloudrc.flight.pod.teleop_link import UnixDatagrams
 
 
 def check() -> None:
