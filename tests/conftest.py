@@ -184,7 +184,7 @@ def signals_stay_as_they_were():
 
 @pytest.fixture(scope="module")
 def shared_files():
-    """Read, check and compile the files of robots and scenes once for a module, as a sweep does.
+    """Read and check the files of robots and scenes once for a module, as a sweep does.
 
     No test of the module may change a file that another one flies.
     """

@@ -49,9 +49,8 @@ def _sources(folder: Traversable, above: str = "") -> Iterator[tuple[str, bytes]
     """Yield path and content of each source file, also if the package is in a zip file."""
     for entry in folder.iterdir():
         name = f"{above}{entry.name}"
-        if name.removesuffix(".py") in NOT_FLOWN or entry.name.startswith(
-            "."
-        ):  # hidden: an editor's copy
+        is_hidden = entry.name.startswith(".")  # such as an editor's copy
+        if is_hidden or name.removesuffix(".py") in NOT_FLOWN:
             continue
         if entry.is_dir():
             yield from _sources(entry, f"{name}/")

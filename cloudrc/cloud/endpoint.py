@@ -87,7 +87,7 @@ class CloudEndpoint(TunnelEnd):
         teleop: Source of setpoints and operator requests.
         telemetry: The newest telemetry; None before the first.
         watch: Is called with epoch, counter and content of each telemetry that cloud uses.
-        sight: Receives what the robot sees.
+        sensors: Receives what the robot sees.
     """
 
     telemetry: Telemetry | None = None

@@ -144,7 +144,7 @@ def start(
     settings: PodSettings,
     own_files: Iterable[str] = (),
 ) -> None:
-    """Create the Job `name` whose pods fly `flights`, a file made by `trials.plan.pack`.
+    """Create the Job `name` whose pods fly `flights`, a file made by `flight.trials.plan.pack`.
 
     A failed Job of this name is replaced; a Job that runs or is complete stays as it is. The Job
     belongs to no Helm release. The pods have `own_files` at the same paths as this machine.

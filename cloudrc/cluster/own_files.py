@@ -16,12 +16,11 @@ from typing import Any
 from cloudrc.cluster.client import NotFoundError, Release, run
 from cloudrc.cluster.jobs import owner_of
 from cloudrc.cluster.pods import find_workload
-from cloudrc.config.hull import hull_of
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment, local_files
-from cloudrc.config.robot import files_of, find_robot
-from cloudrc.config.schema import World
+from cloudrc.config.robot import files_of
 from cloudrc.config.shipped import ROBOT_FILE, is_path
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.physics.geometry.model_files import model_files
 
 SCENE_FILE = "scene.xml"
@@ -32,7 +31,7 @@ REMEDY = "or build an image with it: charts/cloudrc/README.md, 'A robot or a sce
 """End of the messages about files that a ConfigMap cannot hold."""
 
 
-def find_own_files(world: World) -> dict[str, dict[str, Path]]:
+def find_own_files(world: ResolvedWorld) -> dict[str, dict[str, Path]]:
     """Find the files of the robot and of the scene that are given by path.
 
     Returns:
@@ -47,9 +46,10 @@ def find_own_files(world: World) -> dict[str, dict[str, Path]]:
     if is_path(world.robot):
         folder = Path(world.robot)
         found["robot"] = {path.name: path for path in folder.iterdir() if path.is_file()}
-        needed = {file for path in files_of(world.robot) for file in model_files(path)}
+        own = files_of(world.robot, world.files.robot)
+        needed = {file for path in own for file in model_files(path)}
         _check("world.robot", folder, needed, found["robot"])
-        _check_size(world.robot)
+        _check_size(world)
     if world.scene.endswith(".xml"):
         scene = Path(world.scene)
         needed = {*model_files(scene)} - {scene}
@@ -69,13 +69,13 @@ def _check(key: str, folder: Path, needed: set[Path], files: Mapping[str, Path])
         raise problem_at(key, f"{folder}: {text}; move what is not needed, {REMEDY}")
 
 
-def _check_size(name: str) -> None:
+def _check_size(world: ResolvedWorld) -> None:
     """Check that a robot has a size, because the cloud pod has no MuJoCo to measure the model."""
-    robot = find_robot(name)
+    robot = world.files.robot
     if robot.hull_m is None and robot.hull_points is None:
-        radius = float(hull_of(name, robot).radii[0])
+        radius = float(world.files.hull.radii[0])
         text = f"in a cluster a robot needs its size; add the line hull_m: {radius + 0.0005:.3f}"
-        raise problem_at("world.robot", f"{Path(name) / ROBOT_FILE}: {text}")
+        raise problem_at("world.robot", f"{Path(world.robot) / ROBOT_FILE}: {text}")
 
 
 def check_size(paths: Iterable[str]) -> None:

@@ -277,8 +277,8 @@ def facts(
     return RobotFacts(world.robot, response, motion, limit, speed, robot.heading)
 
 
-def files_of(name: str) -> list[Path]:
-    """Return the files that the user's robot at a path consists of; [] for a shipped robot.
+def files_of(name: str, robot: RobotFiles) -> list[Path]:
+    """Return the files that the user's robot at the path `name` consists of; [] for a shipped one.
 
     The files that these files name are not in the list.
     """
@@ -286,7 +286,6 @@ def files_of(name: str) -> list[Path]:
         return []
     if name.endswith(".xml"):
         return [Path(name)]
-    robot = find_robot(name)
     named = robot.onboard.name, robot.motion, robot.hull_points
     own = [Path(file) for file in named if file and is_path(file)]
     return [Path(name) / shipped.ROBOT_FILE, robot.model, *own]

@@ -2,7 +2,7 @@
 
 """Define every key of experiments and missions, with its unit, range and default.
 
-The name of a key ends with its unit (`delay_ms`); `flight/assembly.py` and `link/` convert the
+The name of a key ends with its unit (`delay_ms`); `flight/assembly/` and `link/` convert the
 values to SI units. Unknown keys are refused. The defaults are the control scheme and the gains
 of the paper. `Experiment` describes a file. `config.load.ResolvedExperiment` is the result of
 loading the file.

@@ -72,7 +72,7 @@ def fly_fleet(
 ) -> dict[str, Any]:
     """Fly a fleet in mode "virtual" or "local"; write all files into `folder`.
 
-    Return the fleet's report. `page` and `landed` are those of `runs.fly.fly`.
+    Return the fleet's report. `page` and `landed` are those of `flight.fly.fly`.
     """
     flown, members = FleetFlown(experiment, mode), list[_Robot]()
     with naming_files(folder):

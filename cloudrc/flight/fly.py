@@ -185,7 +185,7 @@ def _fly_virtual(
 ) -> dict[str, Any]:
     """Fly in virtual time, and return the report.
 
-    `gone` is that of `assembly.fly`, `landed` that of `fly`.
+    `gone` is that of `fly_virtual`, `landed` that of `fly`.
     """
     interrupted, lost = False, None
     with VirtualRecorder(experiment, folder, see) as recorder:

@@ -44,7 +44,7 @@ def hash_all(experiment: ResolvedExperiment) -> dict[str, str]:
     """Return the path of each of the user's files on which a flight depends -> its hash."""
     values = experiment.model_dump(mode="json")
     named = [*local_files(values).values()] if '"/' in json.dumps(values) else []
-    named += map(str, files_of(experiment.world.robot))
+    named += map(str, files_of(experiment.world.robot, experiment.robot))
     return {file: each for path in named for file, each in hashes(path)}
 
 
@@ -67,7 +67,7 @@ def hash_of_module(name: str, file: Path) -> str:
 def hash_files(experiment: ResolvedExperiment) -> dict[str, str]:
     """Return the dotted key of each of the user's files -> hash of the file and what it needs."""
     named = {key: [path] for key, path in local_files(experiment.model_dump(mode="json")).items()}
-    if robot := files_of(experiment.world.robot):
+    if robot := files_of(experiment.world.robot, experiment.robot):
         named["world.robot"] = [str(file) for file in robot]
     return {key: _hash(paths) for key, paths in named.items()}
 

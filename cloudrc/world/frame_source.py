@@ -19,7 +19,7 @@ from cloudrc.wire.pictures import Decoder, EncodedFrame, Encoder, Image, psnr
 
 
 class Renderer(Protocol):
-    """What renders, `sim.camera.Camera`."""
+    """What renders, `physics.sim.camera.Camera`."""
 
     config: CameraConfig
 

@@ -70,7 +70,7 @@ def test_each_kind_of_source_counts(copy, hash_of):
         ("teleop/mission.py", True),
         ("cloud/loop.py", True),
         ("robots/check.py", True),
-        ("flight/assembly.py", True),
+        ("flight/assembly/world.py", True),
         ("gym/networked.py", True),
         ("cluster/client.py", False),
         ("plugin.py", True),
@@ -85,6 +85,7 @@ def test_a_change_ends_a_sweep_or_an_eval_if_their_rows_may_depend_on_it(
     copy, hash_of, path, counts
 ):
     """Their rows have this hash, and their keys, too."""
+    assert (copy / path).is_file()
     with (copy / path).open("a") as file:
         file.write("# changed\n")
     assert (hash_of(copy) != source.code_hash()) == counts

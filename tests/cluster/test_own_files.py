@@ -8,8 +8,8 @@ import pytest
 
 from cloudrc.base.errors import BadInputError
 from cloudrc.cluster.own_files import find_own_files, send_own_files
-from cloudrc.config.schema import World
 from cloudrc.config.shipped import FOLDERS
+from cloudrc.config.world import ResolvedWorld
 
 MESHES = """<mujoco><compiler meshdir="meshes"/><asset><mesh name="arm" file="arm.stl"/></asset>
 <worldbody/></mujoco>"""
@@ -28,7 +28,7 @@ def robot(tmp_path):
 
 
 def find(robot):
-    return find_own_files(World(robot=str(robot), scene="pillars"))
+    return find_own_files(ResolvedWorld(robot=str(robot), scene="pillars"))
 
 
 def refused(robot):
@@ -39,7 +39,7 @@ def refused(robot):
 
 
 def test_files_in_the_robots_folder_are_found_and_unneeded_folders_left_out(robot):
-    assert find_own_files(World(robot="rover", scene="pillars")) == {}
+    assert find_own_files(ResolvedWorld(robot="rover", scene="pillars")) == {}
     assert sorted(find(robot)["robot"]) == ["robot.xml", "robot.yaml"]
 
 
@@ -76,7 +76,7 @@ def test_a_scene_is_sent_under_a_fixed_name_with_the_files_that_it_names(tmp_pat
     (tmp_path / "lab.xml").write_text(BESIDE)
     (tmp_path / "arm.stl").write_bytes(b"solid")
     (tmp_path / "other.xml").write_text("<mujoco/>")
-    found = find_own_files(World(scene=str(tmp_path / "lab.xml")))
+    found = find_own_files(ResolvedWorld(scene=str(tmp_path / "lab.xml")))
     assert {name: path.name for name, path in found["scene"].items()} == {
         "scene.xml": "lab.xml",
         "arm.stl": "arm.stl",

@@ -96,7 +96,8 @@ def processes_of(run):
         for pid in children.read_text().split():
             line = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
             ways = [word.removeprefix("--direction=") for word in line if "--direction=" in word]
-            found[ways[0] if ways else line[line.index("cloudrc") + 1]] = int(pid)
+            role = ways[0] if ways else line[line.index("process") + 1]
+            found[role] = int(pid)
     return found
 
 
@@ -135,7 +136,7 @@ class Release:
     def start(self, name):
         if name == "teleop":
             (self.folder / "api.json").unlink(missing_ok=True)
-        self.running[name] = self.run(name, "--config", "config.yaml", *self.flags[name])
+        self.running[name] = self.run("process", name, "--config", "config.yaml", *self.flags[name])
 
     def run(self, *words):
         environ = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}

@@ -44,7 +44,7 @@ class ObservedRelease(Release):
     """A release with metrics."""
 
     def run(self, *words):
-        if words[0] in ("world", "cloud", "teleop"):
+        if words[0] == "process":
             address = f"127.0.0.1:{free_ports(1)[0]}"
             self.metrics = [*getattr(self, "metrics", []), address]
             words = (*words, "--metrics", address)

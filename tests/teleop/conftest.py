@@ -436,7 +436,7 @@ def head(method, path, *lines, token=OPERATOR):
 
 @contextmanager
 def running(**options):
-    with reuse_results():  # as in the process of teleop
+    with reuse_results():  # these tests read the same experiment again and again
         one = Running(**options)
         try:
             yield one

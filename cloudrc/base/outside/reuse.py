@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Compute what an experiment, or many points of a sweep, share only once: parsed files, checks.
+"""Share parsed files, checks and hashes among the experiments that one command plans.
 
 Outside of `reuse_results` nothing is kept, because a user may edit a file between two commands of
 a session.

@@ -47,7 +47,7 @@ class OutsideController(Controller):
     """Asks a program for each command; stands still while it has no valid answer.
 
     Attributes:
-        transport: Name or path of the transport to the program: see `drivers.transports`.
+        transport: Name or path of the transport to the program: see `flight.pod.transports`.
         place: Where the program is: an address, or a namespace of ROS.
         start_limit: Time limit for the first answer of an episode [s].
         surroundings: What there is to know besides estimate and setpoint.

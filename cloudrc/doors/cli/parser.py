@@ -72,7 +72,7 @@ MODULES = {
 }
 """Command -> the module in `cloudrc/doors/cli` that contains it, if the module has another name."""
 UNLISTED = {"process": "run one process of a flight: world, cloud, teleop or cell"}
-"""Commands that the chart and the drivers type, so that the list of `--help` leaves them out."""
+"""Commands that the chart and a flight type, so that the list of `--help` leaves them out."""
 COMMANDS = {name: line for group in [*GROUPS.values(), UNLISTED] for name, line in group.items()}
 """Command -> help line."""
 KUBECTL_PLUGIN = "kubectl-cloudrc"

@@ -40,7 +40,7 @@ class WorkerDiedError(InvalidRunError):
 def _start_worker() -> None:
     """Let this worker process end with the parent process, even if SIGKILL ended the parent.
 
-    Until then, it reuses what its calls share, such as the compiled model of a robot.
+    Until then, it reuses what its calls parse, such as files with computing times.
     """
     _of_worker.enter_context(reuse_results())
     parent = multiprocessing.parent_process()

@@ -21,11 +21,8 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.config.robot import find_robot
-from cloudrc.config.shipped import file_of
+from cloudrc.config.world import ResolvedWorld
 from cloudrc.physics.geometry.fence import FLOOR_MARGIN
-from cloudrc.physics.geometry.obstacles import fence_of
-from cloudrc.physics.geometry.scene import load_scene
 from cloudrc.physics.sim.memory import (
     boxes_around,
     contacts_offset,
@@ -34,7 +31,6 @@ from cloudrc.physics.sim.memory import (
 )
 from cloudrc.physics.sim.onboard import Accelerator, Actuators, Onboard
 from cloudrc.physics.sim.readings import Readings
-from cloudrc.physics.sim.scene import compile_model
 from cloudrc.physics.sim.simulator import CONTACT_CHECK_STEPS, Simulator
 from cloudrc.robots.native.library import Library, library
 from cloudrc.wire.messages import NEVER_NS, ZERO, Command, GuardState, Vector
@@ -339,12 +335,10 @@ def _self_test(twin: type[Twin], robot: str, build: Build) -> str:
 
 
 def _parts(robot: str, build: Build) -> tuple[Simulator, Onboard, Guard]:
-    files = find_robot(robot)
-    model = compile_model(files.model, file_of("empty"))
-    onboard, actuators = build(model)
-    fence = fence_of(load_scene("empty"), planar=files.planar)
-    simulator = Simulator(model, actuators, probe=files.probe)
-    return simulator, onboard, Guard(ResolvedGuard(), fence)
+    files = ResolvedWorld(robot=robot, scene="empty").files
+    onboard, actuators = build(files.compiled)
+    simulator = Simulator(files.compiled, actuators, probe=files.robot.probe)
+    return simulator, onboard, Guard(ResolvedGuard(), files.fence)
 
 
 def _fly(robot: Robot) -> list[object]:

@@ -56,7 +56,7 @@ def test_help_fits_80_columns(command, capsys):
     assert max(map(len, text.splitlines())) <= 80
     if not command:
         listed = {line.split()[0] for line in text.splitlines() if line.startswith("  ")}
-        assert COMMANDS.keys() - listed == {"process"}, "which the chart and the drivers type"
+        assert COMMANDS.keys() - listed == {"process"}, "which the chart and a flight type"
         assert len(COMMANDS) <= 31
         assert list(GROUPS)[:4] == ["fly and steer", "links", "studies", "policies"]
         assert main([]) == 0, "no argument prints help, too"

@@ -66,8 +66,8 @@ class GuardMachine(RuleBasedStateMachine):
                 self.stamps.clear()
             elif change.state in (TRACK, HOLD) and event in ("fresh", "time"):
                 self.stamps.append(change.stamp_ns)
-            elif (self.state, change.state) != (HOLD, GROUND):
-                self.stamps.clear()
+            elif event == "spawn" or (self.state, change.state) != (HOLD, GROUND):
+                self.stamps.clear()  # an operator who starts anew is no chatter
             self.state = change.state
         assert self.state is self.guard.state
 
